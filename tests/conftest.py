@@ -1,0 +1,31 @@
+"""Fixtures that several test files share."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+settings.register_profile("repeatable", derandomize=True, deadline=None)
+settings.load_profile("repeatable")
+
+
+@pytest.fixture(scope="session")
+def data_folder() -> Path:
+    """Folder of the real data sets: $UBL_GRAPH_DATA, or shared/data beside the repository."""
+    beside = Path(__file__).resolve().parents[2] / "shared" / "data"
+    folder = Path(os.environ.get("UBL_GRAPH_DATA", beside))
+    if not folder.is_dir():
+        pytest.skip(f"real data are not at {folder}; set UBL_GRAPH_DATA to their folder")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def saga(data_folder: Path) -> Path:
+    """Folder of the GARPOS sample campaign SAGA.1903."""
+    folder = data_folder / "garpos"
+    if not folder.is_dir():
+        pytest.skip(f"the GARPOS sample campaign is not at {folder}")
+    return folder

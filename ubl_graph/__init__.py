@@ -1,0 +1,120 @@
+"""ubl_graph: underwater beacon localisation as a factor graph.
+
+>>> import ubl_graph
+>>> mission = ubl_graph.load_mission("dive.toml")        # doctest: +SKIP
+>>> result = ubl_graph.smooth(mission)                   # doctest: +SKIP
+>>> result.trajectory.at([10.0, 20.0]).position          # doctest: +SKIP
+
+What a name needs is imported when the name is first used: `import ubl_graph` is cheap.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ubl_graph.acoustics import SoundSpeedProfile
+    from ubl_graph.errors import (
+        ConfigurationError,
+        DataError,
+        NoDirectRayError,
+        SolverError,
+        TimeError,
+        UblGraphError,
+        UnobservableError,
+    )
+    from ubl_graph.evaluation import Errors, evaluate
+    from ubl_graph.frames import GeodeticOrigin, LeverArm
+    from ubl_graph.io.mission_file import load_mission
+    from ubl_graph.measurements import (
+        Attitude,
+        Beacon,
+        Depth,
+        OneWayRange,
+        PositionFix,
+        TwoWayRange,
+        Velocity,
+    )
+    from ubl_graph.mission import Mission, Reference, Segment, Start, Vehicle
+    from ubl_graph.options import Options
+    from ubl_graph.result import Result
+    from ubl_graph.smoother import smooth
+    from ubl_graph.trajectory import Trajectory
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "SoundSpeedProfile": "acoustics",
+    "ConfigurationError": "errors",
+    "DataError": "errors",
+    "NoDirectRayError": "errors",
+    "SolverError": "errors",
+    "TimeError": "errors",
+    "UblGraphError": "errors",
+    "UnobservableError": "errors",
+    "Errors": "evaluation",
+    "evaluate": "evaluation",
+    "GeodeticOrigin": "frames",
+    "LeverArm": "frames",
+    "load_mission": "io.mission_file",
+    "Attitude": "measurements",
+    "Beacon": "measurements",
+    "Depth": "measurements",
+    "OneWayRange": "measurements",
+    "PositionFix": "measurements",
+    "TwoWayRange": "measurements",
+    "Velocity": "measurements",
+    "Mission": "mission",
+    "Reference": "mission",
+    "Segment": "mission",
+    "Start": "mission",
+    "Vehicle": "mission",
+    "Options": "options",
+    "Result": "result",
+    "smooth": "smoother",
+    "Trajectory": "trajectory",
+}
+
+__all__ = [  # noqa: RUF022 - by subject, as in `_HOME`
+    "ConfigurationError",
+    "DataError",
+    "NoDirectRayError",
+    "SolverError",
+    "TimeError",
+    "UblGraphError",
+    "UnobservableError",
+    "Attitude",
+    "Beacon",
+    "Depth",
+    "Errors",
+    "GeodeticOrigin",
+    "LeverArm",
+    "Mission",
+    "OneWayRange",
+    "Options",
+    "PositionFix",
+    "Reference",
+    "Result",
+    "Segment",
+    "SoundSpeedProfile",
+    "Start",
+    "Trajectory",
+    "TwoWayRange",
+    "Vehicle",
+    "Velocity",
+    "__version__",
+    "evaluate",
+    "load_mission",
+    "smooth",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'ubl_graph' has no attribute '{name}'")
+    return getattr(import_module(f"ubl_graph.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,162 @@
+"""From a solver's flat vector to a SegmentResult: trajectory, slow states, residuals, status."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ubl_graph.arrays import FloatArray
+from ubl_graph.factors.ranges import RangeBlock
+from ubl_graph.graph import SegmentModel
+from ubl_graph.layout import Chain
+from ubl_graph.mission import Mission
+from ubl_graph.problem import Problem
+from ubl_graph.result import RangeResiduals, SegmentResult, Shared, SlowState, Status
+from ubl_graph.solve.lm import Solution
+from ubl_graph.solve.marginals import Marginals
+from ubl_graph.trajectory import Trajectory
+
+#: Where half of the nodes are known worse than this share of the typical slant range, the
+#: linearised covariance means nothing and the track counts as not observed.
+UNOBSERVED_SHARE = 0.5
+#: The same where there are no ranges to compare with, m.
+UNOBSERVED_SIGMA = 1000.0
+
+
+def assemble_segment(
+    problem: Problem,
+    solution: Solution,
+    marginals: Marginals,
+    chain: Chain,
+    model: SegmentModel,
+    rival: str | None,
+) -> SegmentResult:
+    """Everything that a user reads of one segment.
+
+    Parameters
+    ----------
+    problem, solution, marginals
+        Solved, with covariances.
+    chain, model
+        The segment's nodes and records.
+    rival : str or None
+        What to say of another track that fits as well.
+    """
+    layout = problem.layout
+    trajectory = Trajectory(
+        chain.t,
+        layout.get(solution.x, "position")[chain.nodes],
+        layout.get(solution.x, "velocity")[chain.nodes],
+        layout.get(solution.x, "acceleration")[chain.nodes] if layout.order == 3 else None,
+        marginals.of("position")[chain.nodes],
+        problem.psd,
+    )
+    slow = {name: _slow_state(problem, solution, marginals, chain, name) for name, _ in layout.slow}
+    residuals = _range_residuals(problem, solution, chain, model)
+    status, reason = _status(solution, trajectory, residuals, rival)
+    chi_square, dof = _chi_square(problem, solution)
+    return SegmentResult(
+        chain.name,
+        trajectory,
+        slow,
+        residuals,
+        status,
+        reason,
+        solution.cost,
+        solution.iterations,
+        chi_square,
+        dof,
+    )
+
+
+def shared_of(problem: Problem, solution: Solution, marginals: Marginals) -> dict[str, Shared]:
+    """Estimates of what all nodes share."""
+    return {
+        name: Shared(problem.layout.get(solution.x, name), marginals.of(name))
+        for name, _ in problem.layout.shared
+    }
+
+
+def beacons_of(mission: Mission, shared: dict[str, Shared]) -> dict[str, Shared]:
+    """Every beacon's position: estimated where it was an unknown, else as given."""
+    return {
+        b.name: shared.get(f"beacon {b.name}", Shared(b.position, np.zeros((3, 3))))
+        for b in mission.beacons
+    }
+
+
+def _slow_state(
+    problem: Problem, solution: Solution, marginals: Marginals, chain: Chain, name: str
+) -> SlowState:
+    variance = np.einsum("nii->ni", marginals.of(name)[chain.nodes])
+    return SlowState(chain.t, problem.layout.get(solution.x, name)[chain.nodes], np.sqrt(variance))
+
+
+def _range_residuals(
+    problem: Problem, solution: Solution, chain: Chain, model: SegmentModel
+) -> RangeResiduals | None:
+    parts: list[RangeResiduals] = []
+    for block, frozen in zip(problem.blocks, solution.frozen, strict=True):
+        if not isinstance(block, RangeBlock) or block.chain != chain.name:
+            continue
+        two_way = block.name == "two_way_range"
+        pings = model.segment.two_way_range if two_way else model.segment.one_way_range
+        assert pings is not None and frozen is not None
+        whitened, _ = block.evaluate(solution.x, frozen, jacobian=False)
+        parts.append(
+            RangeResiduals(
+                np.full(len(pings), "two_way" if two_way else "one_way"),
+                pings.beacon,
+                pings.t_transmit,
+                pings.t_receive,
+                np.asarray(pings.travel_time),
+                frozen,
+                whitened[:, 0] * frozen,
+                problem.loss.weights(whitened[:, 0]),
+                block.found(solution.x),
+            )
+        )
+    return RangeResiduals.joined(parts) if parts else None
+
+
+def _status(
+    solution: Solution,
+    trajectory: Trajectory,
+    residuals: RangeResiduals | None,
+    rival: str | None,
+) -> tuple[Status, str]:
+    values, vectors = np.linalg.eigh(trajectory.covariance)
+    sigma = np.sqrt(values[:, -1])
+    limit = UNOBSERVED_SIGMA
+    if residuals is not None:
+        legs = np.where(residuals.kind == "two_way", 2.0, 1.0)
+        limit = UNOBSERVED_SHARE * 1500.0 * float(np.median(np.abs(residuals.travel_time) / legs))
+    if np.median(sigma) > limit:
+        node = int(np.argsort(sigma)[len(sigma) // 2])
+        return "unobservable", (
+            f"the data do not determine the track {_direction(vectors[node, :, -1])} "
+            f"(standard deviation {sigma[node]:.0f} m at half of the nodes or more)"
+        )
+    if rival is not None:
+        return "unobservable", rival
+    if not solution.converged:
+        return "not converged", f"no rest after {solution.iterations} iterations"
+    return "converged", ""
+
+
+def _direction(axis: FloatArray) -> str:
+    """A direction in words: along the vertical, or its bearing."""
+    if abs(axis[2]) > 0.9:
+        return "vertically"
+    bearing = np.rad2deg(np.arctan2(axis[0], axis[1])) % 180.0
+    return f"along {bearing:.0f}/{bearing + 180.0:.0f} degrees"
+
+
+def _chi_square(problem: Problem, solution: Solution) -> tuple[float, int]:
+    """Weighted sum of squared whitened residuals, and rows minus unknowns."""
+    total, rows = 0.0, 0
+    for block, frozen in zip(problem.blocks, solution.frozen, strict=True):
+        r, _ = block.evaluate(solution.x, frozen, jacobian=False)
+        weights = problem.loss.weights(r) if block.robust else 1.0
+        total += float(np.sum(weights * r * r))
+        rows += r.size
+    return total, rows - problem.layout.size

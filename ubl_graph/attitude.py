@@ -1,0 +1,52 @@
+"""Attitude over time, held at what the heading reference says."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from ubl_graph.arrays import FloatArray
+from ubl_graph.frames import LeverArm, world_R_body
+from ubl_graph.measurements import Attitude
+
+
+class AttitudeTrack:
+    """Rotation of the vehicle at any time, by spherical interpolation of attitude records.
+
+    Before the first and after the last record the attitude is held.
+
+    Parameters
+    ----------
+    records : Attitude, optional
+        None or empty: the body axes stay aligned with the world's (only for vehicles without
+        lever arms and body velocities, which `Mission` sees to).
+    """
+
+    def __init__(self, records: Attitude | None) -> None:
+        if records is None or len(records) == 0:
+            records = Attitude(0.0, np.pi / 2)  # heading east: forward-left-up is east-north-up
+        order = np.argsort(records.t)
+        self.t: FloatArray = records.t[order]
+        self._rotations = Rotation.from_matrix(
+            world_R_body(records.heading, records.pitch, records.roll)[order]
+        )
+        self._slerp = Slerp(self.t, self._rotations) if len(self.t) > 1 else None
+
+    def at(self, times: FloatArray) -> FloatArray:
+        """`world_R_body` at times (M,), shape (M, 3, 3)."""
+        times = np.atleast_1d(times)
+        if self._slerp is None:
+            return np.broadcast_to(self._rotations.as_matrix()[0], (len(times), 3, 3))
+        return self._slerp(np.clip(times, self.t[0], self.t[-1])).as_matrix()
+
+    def lever(self, arm: LeverArm, times: FloatArray) -> FloatArray:
+        """Lever arm in world axes at times (M,), shape (M, 3), metres."""
+        if arm.is_zero:
+            return np.zeros((len(times), 3))
+        return self.at(times) @ arm.body
+
+    def lever_rate(self, arm: LeverArm, times: FloatArray, step: float = 0.05) -> FloatArray:
+        """Velocity of a lever arm's tip by rotation, (M, 3), m/s, by central difference."""
+        if arm.is_zero:
+            return np.zeros((len(times), 3))
+        return (self.lever(arm, times + step) - self.lever(arm, times - step)) / (2.0 * step)

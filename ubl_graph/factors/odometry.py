@@ -1,0 +1,267 @@
+"""DVL odometry: high-rate body velocities preintegrated into displacements between nodes.
+
+The DVL's velocity in world axes, u = R(t) v(t), is taken as piecewise linear between samples and
+integrated once, exactly; a node interval's displacement is the difference of two values of that
+integral. Errors of the DVL enter linearly (first order in the angles): with measured v
+
+    v_true = (1 + scale) v + misalignment x v + bias
+
+in forward-left-up axes, so that the same running integral, taken of R v, of R [-v]x and of R,
+holds the displacement and its derivatives. A lever arm r of the DVL adds (R1 - R0) r, and the
+current, for velocities relative to the water, its mean times dt.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ubl_graph.arrays import BoolArray, FloatArray, IntArray
+from ubl_graph.attitude import AttitudeTrack
+from ubl_graph.factors.block import LinearBlock
+from ubl_graph.frames import body_vector
+from ubl_graph.layout import Chain, Layout
+from ubl_graph.measurements import Velocity
+
+#: A gap between samples longer than this many median sample intervals interrupts the odometry,
+GAP_FACTOR = 5.0
+#: but never one shorter than this, s.
+MIN_GAP = 1.0
+
+#: The shared states of a DVL, with their sizes, in the order of `Preintegration` components.
+DVL_STATES = (("dvl_scale", 1), ("dvl_misalignment", 3), ("dvl_bias", 3))
+
+
+@dataclass(frozen=True, eq=False)
+class Displacements:
+    """Preintegrated velocities over M intervals.
+
+    Attributes
+    ----------
+    displacement : array, shape (M, 3)
+        East, north, up of the DVL, m.
+    by_misalignment : array, shape (M, 3, 3)
+        Derivative by the misalignment angles, m/rad.
+    by_bias : array, shape (M, 3, 3)
+        Derivative by the bias, s.
+    sigma : array, shape (M,)
+        Standard deviation of each component, m.
+    covered : array of bool, shape (M,)
+        Whether samples cover the whole interval without a gap.
+    """
+
+    displacement: FloatArray
+    by_misalignment: FloatArray
+    by_bias: FloatArray
+    sigma: FloatArray
+    covered: BoolArray
+
+
+class Preintegration:
+    """Running integral of DVL velocities in world axes.
+
+    Parameters
+    ----------
+    velocity : Velocity
+        Samples of one reference (all bottom or all water), in any order of time.
+    attitude : AttitudeTrack
+        Of the vehicle.
+    psd : float
+        What the velocity does between two samples: white acceleration noise, m^2/s^3.
+    """
+
+    def __init__(self, velocity: Velocity, attitude: AttitudeTrack, psd: float) -> None:
+        rows = velocity[np.argsort(velocity.t)]
+        self.t: FloatArray = rows.t
+        body = body_vector(rows.forward, rows.right, rows.down)
+        rotation = attitude.at(self.t)
+        cross = _cross_matrices(body)
+        # World velocity, its derivative by misalignment and by bias, as 3 + 9 + 9 columns.
+        self._rates = np.concatenate(
+            [
+                np.einsum("mij,mj->mi", rotation, body),
+                -(rotation @ cross).reshape(-1, 9),
+                rotation.reshape(-1, 9),
+            ],
+            axis=1,
+        )
+        gaps = np.diff(self.t)
+        typical = float(np.median(gaps)) if len(gaps) else 1.0
+        self.longest_gap = max(GAP_FACTOR * typical, MIN_GAP)
+        self._open = gaps <= self.longest_gap
+        self._integral = _running(gaps[:, None] * (self._rates[1:] + self._rates[:-1]) / 2.0)
+        # White sample noise held over a gap, and what linear interpolation in the gap misses.
+        noise = (rows.sigma[1:] ** 2 + rows.sigma[:-1] ** 2) / 2.0
+        self._variance = _running((noise * gaps**2 + psd * gaps**3 / 12.0)[:, None])[:, 0]
+        self._missing = _running(np.where(self._open, 0.0, gaps)[:, None])[:, 0]
+        self._sigma: FloatArray = rows.sigma
+
+    def breaks(self) -> FloatArray:
+        """Sample times at which coverage starts or ends, s: nodes should stand there."""
+        closed = np.flatnonzero(~self._open)
+        return self.t[np.concatenate([[0], closed, closed + 1, [len(self.t) - 1]])]
+
+    def between(self, t0: FloatArray, t1: FloatArray) -> Displacements:
+        """Displacements of the DVL from `t0` to `t1`, (M,) each, s."""
+        first, last = self._integrals_at(t0), self._integrals_at(t1)
+        d = last[0] - first[0]
+        variance = last[1] - first[1]
+        missing = last[2] - first[2]
+        covered = (t0 >= self.t[0] - 1e-6) & (t1 <= self.t[-1] + 1e-6) & (missing < 1e-6)
+        return Displacements(
+            d[:, :3],
+            d[:, 3:12].reshape(-1, 3, 3),
+            d[:, 12:].reshape(-1, 3, 3),
+            np.sqrt(np.maximum(variance, 0.0)),
+            covered,
+        )
+
+    def rates_at(self, t: FloatArray) -> Displacements:
+        """The same for rates: velocity of the DVL at times (M,), m/s, and its derivatives."""
+        k, s = self._place(t)
+        k1 = np.minimum(k + 1, len(self.t) - 1)
+        rates = (1.0 - s)[:, None] * self._rates[k] + s[:, None] * self._rates[k1]
+        near = np.where(s < 0.5, k, k1)
+        open_ = np.append(self._open, False)[k] | (s == 0.0) | (s == 1.0)
+        covered = (t >= self.t[0] - 1e-6) & (t <= self.t[-1] + 1e-6) & open_
+        return Displacements(
+            rates[:, :3],
+            rates[:, 3:12].reshape(-1, 3, 3),
+            rates[:, 12:].reshape(-1, 3, 3),
+            self._sigma[near],
+            covered,
+        )
+
+    def _place(self, t: FloatArray) -> tuple[IntArray, FloatArray]:
+        if len(self.t) == 1:
+            return np.zeros(len(t), dtype=np.int64), np.zeros(len(t))
+        k = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2)
+        s = np.clip((t - self.t[k]) / (self.t[k + 1] - self.t[k]), 0.0, 1.0)
+        return k, s
+
+    def _integrals_at(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Integral of the rates, variance and missing time from the first sample up to `t`."""
+        k, s = self._place(t)
+        k1 = np.minimum(k + 1, len(self.t) - 1)
+        h = (self.t[k1] - self.t[k])[:, None]
+        f = s[:, None]
+        part = h * f * ((1.0 - f / 2.0) * self._rates[k] + f / 2.0 * self._rates[k1])
+        variance = self._variance[k] + s * (self._variance[k1] - self._variance[k])
+        missing = self._missing[k] + s * (self._missing[k1] - self._missing[k])
+        return self._integral[k] + part, variance, missing
+
+
+def odometry(
+    layout: Layout,
+    chain: Chain,
+    samples: Preintegration,
+    lever: FloatArray,
+    *,
+    current: bool,
+) -> tuple[LinearBlock, BoolArray]:
+    """Displacement rows of every covered interval: p1 - p0 - displacement, 3 each.
+
+    Parameters
+    ----------
+    layout, chain
+        Whose nodes.
+    samples : Preintegration
+        Of one reference.
+    lever : array, shape (N, 3)
+        Reference point to DVL at the nodes, world axes, m.
+    current : bool
+        Whether the velocities are relative to the water.
+
+    Returns
+    -------
+    LinearBlock, array of bool (N - 1,)
+        And which intervals are covered.
+    """
+    moved = samples.between(chain.t[:-1], chain.t[1:])
+    rows = np.flatnonzero(moved.covered)
+    k = chain.first + rows
+    dt = np.diff(chain.t)[rows]
+    eye = np.broadcast_to(np.eye(3), (len(rows), 3, 3))
+    columns = [layout.node_columns("position", k), layout.node_columns("position", k + 1)]
+    parts = [-eye, eye]
+    for name, slope in _error_slopes(moved, rows):
+        if layout.has(name):
+            columns.append(_shared(layout, name, len(rows)))
+            parts.append(-slope * layout.unit(name))
+    if current:
+        half = np.zeros((len(rows), 3, 2))
+        half[:, 0, 0] = half[:, 1, 1] = -dt / 2.0
+        for end in (k, k + 1):
+            columns.append(layout.node_columns("current", end))
+            parts.append(half)
+    inverse = 1.0 / moved.sigma[rows]
+    target = moved.displacement[rows] - (lever[rows + 1] - lever[rows])
+    block = LinearBlock(
+        "water odometry" if current else "odometry",
+        np.concatenate(columns, axis=1),
+        np.concatenate(parts, axis=2) * inverse[:, None, None],
+        target * inverse[:, None],
+    )
+    return block, moved.covered
+
+
+def node_velocity(
+    layout: Layout,
+    chain: Chain,
+    samples: Preintegration,
+    lever_rate: FloatArray,
+    *,
+    current: bool,
+) -> LinearBlock:
+    """Velocity rows at every covered node: v + d(R r)/dt - DVL velocity, 3 each.
+
+    `lever_rate` is the DVL's velocity by rotation about the reference point, (N, 3), m/s.
+    """
+    rates = samples.rates_at(chain.t)
+    rows = np.flatnonzero(rates.covered)
+    k = chain.first + rows
+    eye = np.broadcast_to(np.eye(3), (len(rows), 3, 3))
+    columns = [layout.node_columns("velocity", k)]
+    parts = [eye]
+    for name, slope in _error_slopes(rates, rows):
+        if layout.has(name):
+            columns.append(_shared(layout, name, len(rows)))
+            parts.append(-slope * layout.unit(name))
+    if current:
+        drift = np.zeros((len(rows), 3, 2))
+        drift[:, 0, 0] = drift[:, 1, 1] = -1.0
+        columns.append(layout.node_columns("current", k))
+        parts.append(drift)
+    inverse = 1.0 / rates.sigma[rows]
+    target = rates.displacement[rows] - lever_rate[rows]
+    return LinearBlock(
+        "water velocity" if current else "velocity",
+        np.concatenate(columns, axis=1),
+        np.concatenate(parts, axis=2) * inverse[:, None, None],
+        target * inverse[:, None],
+    )
+
+
+def _error_slopes(d: Displacements, rows: IntArray) -> list[tuple[str, FloatArray]]:
+    """Derivatives of displacement or rate by each DVL state, (M, 3, size)."""
+    slopes = (d.displacement[rows][:, :, None], d.by_misalignment[rows], d.by_bias[rows])
+    return [(name, slope) for (name, _), slope in zip(DVL_STATES, slopes, strict=True)]
+
+
+def _shared(layout: Layout, name: str, m: int) -> IntArray:
+    columns = layout.shared_columns(name)
+    return np.broadcast_to(columns, (m, len(columns)))
+
+
+def _cross_matrices(v: FloatArray) -> FloatArray:
+    """[v]x with [v]x w = v x w, shape (M, 3, 3)."""
+    out = np.zeros((len(v), 3, 3))
+    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
+    out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = v[:, 2], -v[:, 1], v[:, 0]
+    return out
+
+
+def _running(steps: FloatArray) -> FloatArray:
+    """Cumulative sums from zero along the first axis, one longer than `steps`."""
+    return np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)])

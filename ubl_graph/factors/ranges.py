@@ -1,0 +1,191 @@
+"""The range residual, two-way and one-way: travel times of the model minus the measured one.
+
+A ping has legs: a two-way one from the vehicle at transmit time to the beacon and back to the
+vehicle at receive time, a one-way one from the beacon to the vehicle at receive time. With tau
+the acoustic time of one leg, g the logarithm of the sound-speed scale's effect and c the clock
+offset (one-way only),
+
+    residual = sum over legs of tau(antenna at its time, beacon) exp(g at its time) + c - measured
+
+The residual sees antenna positions and their derivatives alone; how a position is made of node
+states is the layout's business (`Interpolation`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ubl_graph.acoustics import TravelTimes
+from ubl_graph.arrays import BoolArray, FloatArray, IntArray
+from ubl_graph.factors.block import ALL_ROWS
+from ubl_graph.layout import Interpolation
+
+#: Travel times between two sets of points, (M, 3) each.
+TravelTimeModel = Callable[[FloatArray, FloatArray], TravelTimes]
+
+
+@dataclass(frozen=True, eq=False)
+class Legs:
+    """The legs of M pings, L each, as the residual needs them.
+
+    Attributes
+    ----------
+    position : Interpolation
+        Of the reference point at each leg's time, rows ping after ping (M * L).
+    lever : array, shape (M, L, 3)
+        Reference point to transducer, world axes, m.
+    psd : array, shape (3,)
+        Noise density of the motion prior per axis, for the interpolation's variance.
+    variance_factor : array, shape (M * L,)
+        Interpolation variance at unit density (`trajectory.interpolation_variance`).
+    """
+
+    position: Interpolation
+    lever: FloatArray
+    psd: FloatArray
+    variance_factor: FloatArray
+
+
+class RangeBlock:
+    """Residuals of M pings, one whitened component each.
+
+    Parameters
+    ----------
+    name : str
+        "two_way_range" or "one_way_range".
+    chain : str
+        Name of the chain whose pings they are.
+    model : callable
+        Acoustic times and gradients of (N, 3) antenna and (N, 3) beacon positions.
+    legs : Legs
+        Antenna positions.
+    beacons : array, shape (M, 3)
+        Beacon positions, ENU m; where beacons are estimated, only their starting values.
+    measured : array, shape (M,)
+        Travel time, s, without turnaround; as stamped for one-way ranges.
+    sigma : array, shape (M,)
+        Its standard deviation, s.
+    sound_speed : Interpolation, optional
+        Of the log scale at each leg's time (M * L rows, one component).
+    clock : Interpolation, optional
+        Of the clock offset at the receive time (M rows, one component).
+    beacon_columns : array of int, shape (M, 3), optional
+        Where beacons are unknowns.
+    """
+
+    linear = False
+    robust = True
+
+    def __init__(
+        self,
+        name: str,
+        chain: str,
+        model: TravelTimeModel,
+        legs: Legs,
+        beacons: FloatArray,
+        measured: FloatArray,
+        sigma: FloatArray,
+        sound_speed: Interpolation | None = None,
+        clock: Interpolation | None = None,
+        beacon_columns: IntArray | None = None,
+    ) -> None:
+        self.name = name
+        self.chain = chain
+        self.model = model
+        self.measured = measured
+        self.sigma = sigma
+        self.legs = legs
+        m, n_legs = legs.lever.shape[:2]
+        self._lever = legs.lever
+        self._position = _by_leg(legs.position, m, n_legs)
+        self._sound_speed = None if sound_speed is None else _by_leg(sound_speed, m, n_legs)
+        self._clock = None if clock is None else _by_leg(clock, m, 1)
+        self._beacons = np.repeat(beacons[:, None, :], n_legs, axis=1)
+        self._beacon_columns = beacon_columns
+        parts = [self._position[0].reshape(m, -1)]
+        slow = (self._sound_speed, self._clock)
+        parts += [part[0].reshape(m, -1) for part in slow if part is not None]
+        if beacon_columns is not None:
+            parts.append(beacon_columns)
+        self.columns = np.concatenate(parts, axis=1)
+
+    def __len__(self) -> int:
+        return len(self.measured)
+
+    def frozen(self, x: FloatArray) -> FloatArray:
+        """Standard deviation of each row (M,), s: the measurement's and the interpolation's.
+
+        The variance of the trajectory between its nodes is projected on the legs' directions at
+        `x`. The legs of one ping count as independent: they lie in different intervals, or the
+        interval is so short that the term vanishes.
+        """
+        slopes = self._model_terms(x, ALL_ROWS)[2]
+        variance = self.legs.variance_factor.reshape(slopes.shape[:2])[..., None] * self.legs.psd
+        return np.sqrt(self.sigma**2 + (slopes**2 * variance).sum(axis=(1, 2)))
+
+    def found(self, x: FloatArray) -> BoolArray:
+        """Whether a direct ray exists for all legs of each ping, (M,)."""
+        total, _, _, _, travel = self._model_terms(x, ALL_ROWS)
+        return np.all(travel.found.reshape(len(total), -1), axis=1)
+
+    def evaluate(
+        self,
+        x: FloatArray,
+        frozen: FloatArray | None = None,
+        rows: slice = ALL_ROWS,
+        jacobian: bool = True,
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Whitened residuals (m, 1) of `rows` at `x` and Jacobians (m, 1, C)."""
+        sigma = (self.sigma if frozen is None else frozen)[rows]
+        total, times, slopes, scale, travel = self._model_terms(x, rows)
+        residual = ((total - self.measured[rows]) / sigma)[:, None]
+        if not jacobian:
+            return residual, None
+        m = len(total)
+        weights = self._position[1][rows]
+        parts = [(slopes[:, :, None, :] * weights[..., None]).reshape(m, -1)]
+        if self._sound_speed is not None:
+            parts.append((times[..., None] * self._sound_speed[1][rows]).reshape(m, -1))
+        if self._clock is not None:
+            parts.append(self._clock[1][rows].reshape(m, -1))
+        if self._beacon_columns is not None:
+            back = travel.gradient_b.reshape(slopes.shape)
+            parts.append((back * scale[..., None]).sum(axis=1))
+        jacobians = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+        return residual, (jacobians / sigma[:, None])[:, None, :]
+
+    def _model_terms(
+        self, x: FloatArray, rows: slice
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, TravelTimes]:
+        """Total time (m,), times by leg (m, L), their gradients (m, L, 3), scale, raw times."""
+        columns, weights = self._position[0][rows], self._position[1][rows]
+        antenna = (x[columns] * weights[..., None]).sum(axis=2) + self._lever[rows]
+        m, n_legs = antenna.shape[:2]
+        if self._beacon_columns is None:
+            beacon = self._beacons[rows]
+        else:
+            beacon = np.repeat(x[self._beacon_columns[rows]][:, None, :], n_legs, axis=1)
+        travel = self.model(antenna.reshape(-1, 3), beacon.reshape(-1, 3))
+        times = travel.time.reshape(m, n_legs)
+        slopes = travel.gradient_a.reshape(m, n_legs, 3)
+        scale = np.ones_like(times)
+        if self._sound_speed is not None:
+            columns, weights = self._sound_speed[0][rows], self._sound_speed[1][rows]
+            scale = np.exp((x[columns[..., 0]] * weights).sum(axis=2))
+            times = times * scale
+            slopes = slopes * scale[..., None]
+        total = times.sum(axis=1)
+        if self._clock is not None:
+            columns, weights = self._clock[0][rows], self._clock[1][rows]
+            total = total + (x[columns[..., 0]] * weights).sum(axis=(1, 2))
+        return total, times, slopes, scale, travel
+
+
+def _by_leg(part: Interpolation, m: int, n_legs: int) -> tuple[IntArray, FloatArray]:
+    """Columns (M, L, W, D) and weights (M, L, W). Padding stays -1: its weight is zero."""
+    width = part.weights.shape[1]
+    columns = part.columns.reshape(m, n_legs, width, -1)
+    return columns, part.weights.reshape(m, n_legs, width)

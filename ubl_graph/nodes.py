@@ -1,0 +1,101 @@
+"""Where the nodes of a segment stand in time."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ubl_graph.arrays import FloatArray
+from ubl_graph.errors import DataError
+from ubl_graph.factors.odometry import Preintegration
+from ubl_graph.mission import Segment
+from ubl_graph.options import Options
+from ubl_graph.trajectory import Order, longest_interval
+
+#: Speed that turns a travel time's sigma into metres for the spacing rule, m/s.
+NOMINAL_SPEED = 1500.0
+#: Nodes are left out only where the interpolation's sd stays under this share of the range
+#: sigma: that error is shared by the legs of a ping and by pings close in time, so it must be
+#: well below what a single ping may have.
+INTERPOLATION_SHARE = 0.1
+#: Without any measurement to ask for a node there is one at least every so many seconds.
+LONGEST_GAP = 10.0
+
+
+def order_of(options: Options) -> Order:
+    """Order of the motion prior that the options ask for."""
+    return 2 if options.motion == "constant_velocity" else 3
+
+
+def node_times(
+    segment: Segment, options: Options, odometry: tuple[Preintegration, ...] = ()
+) -> FloatArray:
+    """Node times of a segment, strictly increasing, s.
+
+    A node stands at every transmit and receive time, at the start prior, where odometry begins
+    and ends, and at the ends of the span of ranges, fixes and velocities; times so close that
+    the motion prior bridges them well under the range noise share nodes, and long gaps are
+    filled.
+
+    Raises
+    ------
+    DataError
+        Where the span is longer than a year: times of different epochs.
+    """
+    wanted, kept, sigmas = _candidates(segment, odometry)
+    span = wanted[-1] - wanted[0]
+    if span > 366 * 86400.0:
+        raise DataError(
+            f"the data span {span:g} s, more than a year",
+            "are all times of one segment in the same epoch?",
+        )
+    psd = max(options.horizontal_psd, options.vertical_psd)
+    spacing = longest_interval(order_of(options), psd, INTERPOLATION_SHARE * min(sigmas))
+    return _filled(_thinned(wanted, np.isin(wanted, kept), spacing))
+
+
+def _candidates(
+    segment: Segment, odometry: tuple[Preintegration, ...]
+) -> tuple[FloatArray, FloatArray, list[float]]:
+    """Sorted candidate times, those that must stay, and the range sigmas in metres."""
+    wanted: list[FloatArray] = [p.breaks() for p in odometry]
+    kept: list[FloatArray] = list(wanted)
+    sigmas: list[float] = []
+    if segment.two_way_range is not None and len(segment.two_way_range):
+        wanted += [segment.two_way_range.t_transmit, segment.two_way_range.t_receive]
+        sigmas.append(float(segment.two_way_range.sigma.min()) * NOMINAL_SPEED / 2.0)
+    if segment.one_way_range is not None and len(segment.one_way_range):
+        wanted.append(segment.one_way_range.t_receive)
+        sigmas.append(float(segment.one_way_range.sigma.min()) * NOMINAL_SPEED)
+    if segment.position is not None and len(segment.position):
+        ends = np.array([segment.position.t.min(), segment.position.t.max()])
+        wanted.append(ends)
+        sigmas.append(float(np.sqrt(segment.position.covariances[:, 0, 0].min())))
+    if segment.start is not None:
+        wanted.append(np.array([segment.start.t]))
+        kept.append(wanted[-1])
+    times = np.unique(np.concatenate(wanted))
+    # Stamps of one instant may differ by rounding; two nodes a microsecond apart help nobody.
+    times = times[np.concatenate([[True], np.diff(times) > 1e-6])]
+    return times, np.concatenate(kept) if kept else np.empty(0), sigmas
+
+
+def _thinned(times: FloatArray, must_stay: np.ndarray, spacing: float) -> FloatArray:
+    """Leave out times whose neighbours are within `spacing` of each other."""
+    if len(times) < 3 or np.diff(times).min() > spacing:
+        return times
+    chosen = [times[0]]
+    for i in range(1, len(times) - 1):
+        if must_stay[i] or times[i + 1] - chosen[-1] > spacing:
+            chosen.append(times[i])
+    chosen.append(times[-1])
+    return np.array(chosen)
+
+
+def _filled(times: FloatArray) -> FloatArray:
+    """Split gaps longer than `LONGEST_GAP` into equal parts."""
+    gaps = np.diff(times)
+    parts = np.maximum(np.ceil(gaps / LONGEST_GAP - 1e-9), 1.0).astype(np.int64)
+    if (parts == 1).all():
+        return times
+    pieces = [t + gap / n * np.arange(n) for t, gap, n in zip(times[:-1], gaps, parts, strict=True)]
+    return np.concatenate([*pieces, times[-1:]])

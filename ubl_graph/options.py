@@ -1,0 +1,170 @@
+"""Every knob of the smoother, with its unit, its default and the reason for it.
+
+The attribute docstrings are the documentation; `docs/mission-file.md` shows the same keys as
+they stand under `[options]` in a mission file.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Literal
+
+from ubl_graph.errors import ConfigurationError
+
+Motion = Literal["constant_velocity", "constant_acceleration"]
+Loss = Literal["cauchy", "huber", "geman_mcclure", "dcs", "none"]
+Rays = Literal["auto", "straight", "eigenray"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Options of a mission. All are optional; quantities are SI unless the name ends in a unit.
+
+    Raises
+    ------
+    ConfigurationError
+        Where a value is of the wrong kind, not finite, or outside its range.
+    """
+
+    motion: Motion = "constant_velocity"
+    """Motion prior between nodes: white noise on acceleration or on jerk."""
+
+    acceleration_psd: float = 2e-3
+    """Horizontal acceleration noise of the constant-velocity prior, m^2/s^3. After a time t an
+    unaided velocity has drifted by sqrt(psd t): 0.45 m/s in 100 s."""
+
+    vertical_acceleration_psd: float | None = None
+    """The same for the vertical; left out, it equals the horizontal one (for a surface vessel,
+    which heaves, a garpos mission takes 0.3)."""
+
+    jerk_psd: float = 1e-5
+    """Horizontal jerk noise of the constant-acceleration prior, m^2/s^5."""
+
+    vertical_jerk_psd: float | None = None
+    """The same for the vertical; left out, it equals the horizontal one."""
+
+    speed_sigma: float = 10.0
+    """What is known of the velocity before any measurement: zero within this, m/s."""
+
+    loss: Loss = "cauchy"
+    """Robust loss on the acoustic ranges; its width gives 95 % efficiency on normal noise."""
+
+    rays: Rays = "auto"
+    """Travel times along straight lines at the harmonic-mean speed, or along eigenrays; auto
+    takes eigenrays where the sound speed is a profile."""
+
+    travel_time_sigma: float = 1e-4
+    """Standard deviation of a travel time where the data give none, s."""
+
+    estimate_sound_speed: bool = True
+    """Whether a slowly varying scale of the sound speed is estimated."""
+
+    sound_speed_sigma: float | None = None
+    """Relative standard deviation of the sound speed at a segment's start. Left out: 1e-3 for a
+    profile (1.5 m/s), 5e-3 for a constant (7.5 m/s, the spread of column means at sea)."""
+
+    sound_speed_walk: float = 2e-6
+    """Random walk of the relative sound speed, 1/sqrt(s): 1.2e-4 (0.18 m/s) in an hour."""
+
+    estimate_beacons: bool = False
+    """False: beacons are constants. True: unknowns with their `sigma` as prior."""
+
+    estimate_current: bool = False
+    """Whether the water current is estimated; needed for water-track velocities."""
+
+    current_sigma: float = 0.5
+    """Standard deviation of each component of the current at the start, m/s."""
+
+    current_walk: float = 2e-3
+    """Random walk of the current, m/s per sqrt(s): 0.12 m/s in an hour."""
+
+    clock_offset_sigma: float = 1.0
+    """Standard deviation of the clock offset (vehicle - beacon) at the start, s."""
+
+    clock_drift_sigma: float = 1e-5
+    """Standard deviation of the clock drift at the start, s/s (10 ppm, a bare crystal)."""
+
+    clock_walk: float = 1e-7
+    """Random walk of the clock offset beyond its drift, s per sqrt(s)."""
+
+    clock_drift_walk: float = 1e-10
+    """Random walk of the clock drift, s/s per sqrt(s)."""
+
+    dvl_scale_sigma: float = 3e-3
+    """Standard deviation of the DVL's scale error; 0 leaves the state out."""
+
+    dvl_bias_sigma: float = 2e-3
+    """Standard deviation of each component of the DVL's bias, m/s; 0 leaves the state out."""
+
+    dvl_misalignment_sigma_deg: float = 0.5
+    """Standard deviation of each angle between DVL and attitude reference, degrees; the
+    attitude's own sigma is added in square. 0 leaves the state out."""
+
+    start_window: float = 80.0
+    """Length of the windows in which a start is searched, s."""
+
+    max_iterations: int = 100
+    """Levenberg-Marquardt iterations after which a solve counts as not converged."""
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            kind = str(f.type)
+            if kind.startswith("float"):
+                self._check_number(f.name, value, optional="None" in kind)
+        choices: dict[str, tuple[str, ...]] = {
+            "motion": ("constant_velocity", "constant_acceleration"),
+            "loss": ("cauchy", "huber", "geman_mcclure", "dcs", "none"),
+            "rays": ("auto", "straight", "eigenray"),
+        }
+        for name, allowed in choices.items():
+            if getattr(self, name) not in allowed:
+                raise ConfigurationError(
+                    f"'{getattr(self, name)}' is not one of {', '.join(allowed)}",
+                    field=f"options.{name}",
+                )
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if str(f.type) == "bool" and not isinstance(value, bool):
+                raise ConfigurationError(
+                    f"{value!r} is neither True nor False", field=f"options.{f.name}"
+                )
+        most = self.max_iterations
+        if type(most) is not int or most < 1:
+            raise ConfigurationError(
+                f"{most!r} is no number of iterations",
+                "give 1 or more",
+                field="options.max_iterations",
+            )
+
+    def _check_number(self, name: str, value: float | None, *, optional: bool) -> None:
+        if value is None and optional:
+            return
+        may_vanish = name.startswith(("dvl_", "sound_speed_", "current_walk", "clock_"))
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, (int, float))
+            or not math.isfinite(value)
+            or value < 0.0
+            or (value == 0.0 and not may_vanish)
+        ):
+            raise ConfigurationError(
+                f"{value} is not a {'non-negative' if may_vanish else 'positive'} number",
+                field=f"options.{name}",
+            )
+
+    @property
+    def vertical_psd(self) -> float:
+        """Vertical noise density of the motion prior in force, m^2/s^3 or m^2/s^5."""
+        given = (
+            self.vertical_acceleration_psd
+            if self.motion == "constant_velocity"
+            else self.vertical_jerk_psd
+        )
+        return self.horizontal_psd if given is None else given
+
+    @property
+    def horizontal_psd(self) -> float:
+        """Horizontal noise density of the motion prior in force, m^2/s^3 or m^2/s^5."""
+        return self.acceleration_psd if self.motion == "constant_velocity" else self.jerk_psd

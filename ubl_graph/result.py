@@ -1,0 +1,263 @@
+"""What smoothing gives: trajectories with covariances, slow states, residuals, and a status."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from ubl_graph.arrays import BoolArray, FloatArray
+from ubl_graph.errors import ConfigurationError, TimeError
+from ubl_graph.mission import Mission
+from ubl_graph.trajectory import States, Trajectory
+
+Status = Literal["converged", "not converged", "unobservable"]
+
+#: A ping whose robust weight is below this counts as down-weighted.
+DOWN_WEIGHTED = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class SlowState:
+    """A slowly varying quantity along a segment.
+
+    Attributes
+    ----------
+    t : array, shape (N,)
+        Node times, s.
+    value, sigma : array, shape (N, size)
+        Estimate and standard deviation, SI. `sound_speed` is the logarithm of the factor on
+        the travel times: the true speed is the given one times exp(-value).
+    """
+
+    t: FloatArray
+    value: FloatArray
+    sigma: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Shared:
+    """A constant quantity: a beacon's position, a DVL's scale.
+
+    Attributes
+    ----------
+    value : array, shape (size,)
+        Estimate, SI.
+    covariance : array, shape (size, size)
+        Its covariance; zero where it was not estimated.
+    """
+
+    value: FloatArray
+    covariance: FloatArray
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviations, shape (size,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+@dataclass(frozen=True, eq=False)
+class RangeResiduals:
+    """Residuals of a segment's ranges, one row a ping in the order of the records.
+
+    Attributes
+    ----------
+    kind : array of str, shape (M,)
+        "two_way" or "one_way".
+    beacon : array of str, shape (M,)
+        Name of the beacon.
+    t_transmit, t_receive : array, shape (M,)
+        s, as given.
+    travel_time, sigma, residual : array, shape (M,)
+        Measured travel time, standard deviation of the residual (measurement and interpolation),
+        and model minus measurement; s.
+    weight : array, shape (M,)
+        Robust weight, 1 for a ping that counts in full.
+    found : array of bool, shape (M,)
+        Whether a direct ray exists at the estimate.
+    """
+
+    kind: FloatArray
+    beacon: FloatArray
+    t_transmit: FloatArray
+    t_receive: FloatArray
+    travel_time: FloatArray
+    sigma: FloatArray
+    residual: FloatArray
+    weight: FloatArray
+    found: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.residual)
+
+    @property
+    def down_weighted(self) -> BoolArray:
+        """Which pings count for less than half."""
+        return self.weight < DOWN_WEIGHTED
+
+    @staticmethod
+    def joined(parts: Sequence[RangeResiduals]) -> RangeResiduals:
+        """All rows of several tables, in order."""
+        names = RangeResiduals.__dataclass_fields__
+        return RangeResiduals(*(np.concatenate([getattr(p, n) for p in parts]) for n in names))
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentResult:
+    """What smoothing gives for one segment.
+
+    Attributes
+    ----------
+    name : str
+        The segment's label.
+    trajectory : Trajectory
+        Nodes with covariances.
+    slow : dict of str to SlowState
+        `sound_speed`, `clock_offset` (s), `clock_drift`, `current` (m/s east, north).
+    residuals : RangeResiduals or None
+        None where the segment has no ranges.
+    status, reason : str
+        What came of it, and why it is not "converged".
+    cost : float
+        Of the problem it was solved in (segments that share unknowns are solved together).
+    iterations : int
+        Of that problem.
+    chi_square, degrees_of_freedom : float, int
+        Weighted sum of squared whitened residuals of that problem; rows minus unknowns.
+    """
+
+    name: str
+    trajectory: Trajectory
+    slow: dict[str, SlowState]
+    residuals: RangeResiduals | None
+    status: Status
+    reason: str
+    cost: float
+    iterations: int
+    chi_square: float
+    degrees_of_freedom: int
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What `smooth` gives.
+
+    Attributes
+    ----------
+    mission : Mission
+        What was smoothed.
+    segments : tuple of SegmentResult
+        In the mission's order.
+    beacons : dict of str to Shared
+        Every beacon; covariance zero where beacons are constants.
+    shared : dict of str to Shared
+        DVL errors: `dvl_scale`, `dvl_misalignment` (rad), `dvl_bias` (m/s).
+    warnings : tuple of str
+        What a user should know before trusting it.
+    wall_times : dict of str to float
+        Seconds by stage.
+    """
+
+    mission: Mission
+    segments: tuple[SegmentResult, ...]
+    beacons: dict[str, Shared]
+    shared: dict[str, Shared]
+    warnings: tuple[str, ...] = ()
+    wall_times: dict[str, float] = field(default_factory=dict[str, float])
+
+    @property
+    def status(self) -> Status:
+        """The worst of the segments' statuses."""
+        order: list[Status] = ["converged", "not converged", "unobservable"]
+        return max((s.status for s in self.segments), key=order.index)
+
+    @property
+    def reason(self) -> str:
+        """Why the status is not "converged"; empty where it is."""
+        parts = [(f"{s.name}: " if s.name else "") + s.reason for s in self.segments if s.reason]
+        return "; ".join(parts)
+
+    @property
+    def trajectory(self) -> MissionTrajectory:
+        """All segments' trajectories as one thing to ask."""
+        return MissionTrajectory(self.segments)
+
+    @property
+    def residuals(self) -> RangeResiduals | None:
+        """Range residuals of all segments, or None where there are no ranges."""
+        parts = [s.residuals for s in self.segments if s.residuals is not None]
+        return RangeResiduals.joined(parts) if parts else None
+
+
+class MissionTrajectory:
+    """Trajectories of all segments, asked by time.
+
+    Parameters
+    ----------
+    segments : sequence of SegmentResult
+        Whose trajectories.
+    """
+
+    def __init__(self, segments: Sequence[SegmentResult]) -> None:
+        self._segments = tuple(segments)
+
+    def __getitem__(self, name: str) -> Trajectory:
+        """Trajectory of the segment of this name."""
+        for segment in self._segments:
+            if segment.name == name:
+                return segment.trajectory
+        known = ", ".join(f"'{s.name}'" for s in self._segments)
+        raise ConfigurationError(f"there is no segment '{name}'", f"known: {known}")
+
+    @property
+    def t(self) -> FloatArray:
+        """Node times of all segments, s, segment after segment."""
+        return np.concatenate([s.trajectory.t for s in self._segments])
+
+    @property
+    def position(self) -> FloatArray:
+        """Node positions of all segments, (N, 3), m."""
+        return np.concatenate([s.trajectory.position for s in self._segments])
+
+    @property
+    def velocity(self) -> FloatArray:
+        """Node velocities of all segments, (N, 3), m/s."""
+        return np.concatenate([s.trajectory.velocity for s in self._segments])
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Position covariances of all nodes, (N, 3, 3), m^2."""
+        return np.concatenate([s.trajectory.covariance for s in self._segments])
+
+    def at(self, times: FloatArray | Sequence[float] | float) -> States:
+        """Position, velocity and position covariance at `times` (M,), s.
+
+        Raises
+        ------
+        TimeError
+            Where a time lies in no segment, or in several (ask one of them by name instead).
+        """
+        times = np.atleast_1d(np.asarray(times, dtype=np.float64))
+        tracks = [s.trajectory for s in self._segments]
+        holds = np.stack([(times >= track.t[0]) & (times <= track.t[-1]) for track in tracks])
+        count = holds.sum(axis=0)
+        if (count != 1).any():
+            i = int(np.argmax(count != 1))
+            where = "no segment" if count[i] == 0 else "several segments; ask one by its name"
+            spans = ", ".join(f"{track.t[0]} to {track.t[-1]} s" for track in tracks[:8])
+            raise TimeError(f"t = {times[i]} s lies in {where} (spans: {spans})")
+        out = States(
+            times,
+            np.empty((len(times), 3)),
+            np.empty((len(times), 3)),
+            np.empty((len(times), 3, 3)),
+        )
+        for track, rows in zip(tracks, holds, strict=True):
+            if rows.any():
+                states = track.at(times[rows])
+                out.position[rows] = states.position
+                out.velocity[rows] = states.velocity
+                out.covariance[rows] = states.covariance
+        return out

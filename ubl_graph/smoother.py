@@ -1,0 +1,192 @@
+"""smooth(mission) -> Result: the main path.
+
+A segment is modelled, its start is found, its graph solved, its covariances taken. Segments that
+share nothing are solved one by one: one that the data leave open does not harm the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from time import perf_counter
+
+import numpy as np
+
+from ubl_graph.arrays import FloatArray
+from ubl_graph.assembly import assemble_segment, beacons_of, shared_of
+from ubl_graph.graph import SegmentModel, build_problem, model_segment
+from ubl_graph.initial import START_LIMIT, Starts, Track, find_starts, place
+from ubl_graph.mission import Mission
+from ubl_graph.problem import Problem
+from ubl_graph.result import Result, SegmentResult, Shared
+from ubl_graph.solve.lm import Solution, solve
+from ubl_graph.solve.marginals import Marginals
+
+#: A second track counts as no worse where its cost is higher by less than this: odds of 20 to 1.
+AMBIGUOUS_COST = 3.0
+
+#: Called with what is being done and how far the whole is, 0 to 1.
+Progress = Callable[[str, float], None]
+
+
+def smooth(mission: Mission, progress: Progress | None = None) -> Result:
+    """Smooth a mission: the most probable trajectory given all its records, and how sure it is.
+
+    Parameters
+    ----------
+    mission : Mission
+        From `load_mission`, or made in Python.
+    progress : callable, optional
+        Called now and then with a text and the share done; `ubl-graph smooth` draws a bar by it.
+
+    Returns
+    -------
+    Result
+        With status "unobservable" and the reason where the data leave the track open.
+
+    Raises
+    ------
+    DataError
+        Where the records do not make sense together.
+    SolverError
+        Where a solver fails on data that are sound.
+
+    Examples
+    --------
+    >>> from ubl_graph.sim import straight_pass
+    >>> mission, truth = straight_pass(seed=1)
+    >>> result = smooth(mission)
+    >>> result.status
+    'converged'
+    """
+    work = _Work(mission, progress)
+    with work.stage("model"):
+        models = [model_segment(segment, mission.options) for segment in mission.segments]
+    shared_unknowns = mission.options.estimate_beacons or any(m.bottom or m.water for m in models)
+    groups = [models] if shared_unknowns else [[model] for model in models]
+    segments: list[SegmentResult] = []
+    shared: dict[str, Shared] = {}
+    for number, group in enumerate(groups):
+        work.begin(number / len(groups), 1.0 / len(groups))
+        results, unknowns = _smooth_group(work, group)
+        segments += results
+        shared |= unknowns
+    beacons = beacons_of(mission, shared)
+    shared = {name: s for name, s in shared.items() if not name.startswith("beacon ")}
+    return Result(mission, tuple(segments), beacons, shared, tuple(work.warnings), work.wall_times)
+
+
+def _smooth_group(
+    work: _Work, group: Sequence[SegmentModel]
+) -> tuple[list[SegmentResult], dict[str, Shared]]:
+    """Solve segments that share unknowns (most often a single one) in one problem."""
+    with work.stage("start"):
+        searched = [_search(work, model) for model in group]
+    group = [model for model, _ in searched]
+    with work.stage("solve"):
+        problem = build_problem(work.mission, group)
+        solution, rival = _solve_from(work, problem, [starts for _, starts in searched])
+    with work.stage("covariance"):
+        marginals = Marginals(problem, solution)
+        results = [
+            assemble_segment(problem, solution, marginals, chain, model, rival)
+            for chain, model in zip(problem.layout.chains, group, strict=True)
+        ]
+        return results, shared_of(problem, solution, marginals)
+
+
+def _search(work: _Work, model: SegmentModel) -> tuple[SegmentModel, Starts]:
+    """Find a segment's start; a start prior that all pings contradict is left out, and said."""
+    starts = find_starts(work.mission, model)
+    if starts.start_sigmas is None or starts.start_sigmas < START_LIMIT:
+        return model, starts
+    work.warn(
+        model.segment.name,
+        f"the start prior lies {starts.start_sigmas:.0f} sigma from where the ranges put the "
+        "vehicle; it was left out",
+    )
+    model = replace(model, segment=replace(model.segment, start=None))
+    return model, find_starts(work.mission, model)
+
+
+def _solve_from(
+    work: _Work, problem: Problem, starts: Sequence[Starts]
+) -> tuple[Solution, str | None]:
+    """Solve from the best start, and from its rivals where a single segment has some.
+
+    Returns the cheapest solution, and what to say of a rival that is as good.
+    """
+    tracks = [s.tracks[0] for s in starts]
+    best = work.solve(problem, _vector(problem, tracks))
+    rival: str | None = None
+    for track in starts[0].tracks[1:] if len(starts) == 1 else ():
+        other = work.solve(problem, _vector(problem, [track]))
+        gap = problem.layout.get(best.x, "position") - problem.layout.get(other.x, "position")
+        apart = float(np.sqrt(np.mean(np.sum(gap**2, axis=1))))
+        if apart < 1.0:
+            continue
+        extra = abs(other.cost - best.cost)
+        if extra < AMBIGUOUS_COST:
+            rival = (
+                f"ambiguous: another track, {apart:.0f} m away (rms), fits as well "
+                f"(its cost differs by {extra:.2g}); a start, a fix, a turn or a second beacon "
+                "off the line would tell"
+            )
+        elif other.cost < best.cost:
+            rival = None
+        if other.cost < best.cost:
+            best = other
+    return best, rival
+
+
+def _vector(problem: Problem, tracks: Sequence[Track]) -> FloatArray:
+    """The flat vector that a solver starts at: the tracks, beacons where they are, else zero."""
+    x = np.zeros(problem.layout.size)
+    for chain, track in zip(problem.layout.chains, tracks, strict=True):
+        place(problem.layout, chain, track, x)
+    for block in problem.blocks:
+        if block.name == "beacon prior":
+            matrix = block.evaluate(x)
+            assert matrix[1] is not None
+            x[block.columns[0]] = -matrix[0][0] / np.diag(matrix[1][0])
+    return x
+
+
+@dataclass
+class _Work:
+    """What one call of `smooth` gathers on its way."""
+
+    mission: Mission
+    progress: Progress | None
+    warnings: list[str] = field(default_factory=list[str])
+    wall_times: dict[str, float] = field(default_factory=dict[str, float])
+    _done: float = 0.0
+    _share: float = 1.0
+
+    def begin(self, done: float, share: float) -> None:
+        self._done, self._share = done, share
+
+    def warn(self, segment: str, text: str) -> None:
+        self.warnings.append(f"{segment}: {text}" if segment else text)
+
+    @contextmanager
+    def stage(self, name: str):
+        """Time a stage."""
+        self.tell(name, 0.0)
+        begin = perf_counter()
+        yield
+        self.wall_times[name] = self.wall_times.get(name, 0.0) + perf_counter() - begin
+
+    def tell(self, text: str, share: float) -> None:
+        if self.progress is not None:
+            self.progress(text, self._done + self._share * share)
+
+    def solve(self, problem: Problem, x: FloatArray) -> Solution:
+        most = self.mission.options.max_iterations
+
+        def each(iteration: int, cost: float) -> None:
+            # Nobody knows how many iterations are left; a bar that nears its end serves.
+            self.tell(f"iteration {iteration}, cost {cost:.4g}", 1.0 - 0.85**iteration)
+
+        return solve(problem, x, most, each)

@@ -1,0 +1,1 @@
+"""Solvers: what turns a Problem and a start into an estimate with covariances."""
