@@ -174,7 +174,11 @@ def test_positions_alone_need_neither_beacon_nor_sound_speed(folder):
         ({"options": "[options]\nspeed_sigma = nan"}, "options.speed_sigma", "not a finite number"),
         ({"options": "[options]\nspeed_sigma = -1"}, "options.speed_sigma", "not a positive"),
         ({"options": "[options]\nmax_iterations = 1.5"}, "options.max_iterations", "whole number"),
-        ({"options": "[options]\nmax_iterations = 0"}, "options.max_iterations", "at least one"),
+        (
+            {"options": "[options]\nmax_iterations = 0"},
+            "options.max_iterations",
+            "no number of iterations",
+        ),
         (
             {"options": "[options]\nestimate_beacons = 1"},
             "options.estimate_beacons",

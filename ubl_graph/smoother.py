@@ -6,7 +6,7 @@ share nothing are solved one by one: one that the data leave open does not harm 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from time import perf_counter
@@ -171,7 +171,7 @@ class _Work:
         self.warnings.append(f"{segment}: {text}" if segment else text)
 
     @contextmanager
-    def stage(self, name: str):
+    def stage(self, name: str) -> Generator[None]:
         """Time a stage."""
         self.tell(name, 0.0)
         begin = perf_counter()

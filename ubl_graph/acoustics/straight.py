@@ -33,7 +33,7 @@ class TravelTimes(NamedTuple):
 def straight(profile: SoundSpeedProfile, a: ArrayLike, b: ArrayLike) -> TravelTimes:
     """Travel time along the straight line from a to b.
 
-    time = |b - a| / c_h with the harmonic mean c_h of the speed over the depths of the line,
+    ``time = |b - a| / c_h`` with the harmonic mean c_h of the speed over the depths of the line,
     which is the exact integral of ds/c along it. The gradients are the exact derivatives of that
     formula, so they hold d c_h / d depth too. Where a and b coincide they are zero in their
     horizontal part.

@@ -1,0 +1,222 @@
+"""The command `ubl-graph`: thin, it only parses, shows progress and prints.
+
+Bad input ends with one line on standard error and exit code 2; nothing is written then.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from ubl_graph.errors import UblGraphError
+
+if TYPE_CHECKING:
+    from ubl_graph.evaluation import Errors
+    from ubl_graph.mission import Mission
+    from ubl_graph.result import Result
+    from ubl_graph.smoother import Progress as Report
+
+app = typer.Typer(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Underwater beacon localisation: from acoustic travel times to a trajectory with honest "
+    "covariances.",
+)
+
+#: Work that takes less than this gets no progress bar, s.
+PATIENCE = 1.0
+
+Output = Annotated[
+    Path, typer.Option("-o", "--output", metavar="DIR", help="Folder to write into.")
+]
+Figures = Annotated[bool, typer.Option(help="Draw figures (PNG).")]
+
+
+@app.callback(invoke_without_command=True)
+def root(
+    version: Annotated[bool, typer.Option("--version", help="Print the version and stop.")] = False,
+) -> None:
+    """Name the version, or hand over to a command."""
+    if version:
+        from ubl_graph import __version__
+
+        typer.echo(f"ubl-graph {__version__}")
+        raise typer.Exit
+
+
+@app.command()
+def smooth(
+    mission: Annotated[Path, typer.Argument(metavar="MISSION.toml", help="The mission file.")],
+    output: Output,
+    figures: Figures = True,
+) -> None:
+    """Smooth a mission and write trajectory, residuals, result and figures.
+
+    Example: ubl-graph smooth dive.toml -o dive-out
+    """
+    from ubl_graph.io.mission_file import load_mission
+
+    loaded = load_mission(mission)
+    _check_output(output)
+    result = _smooth(loaded)
+    _write(result, output, figures)
+    _print_result(result)
+
+
+@app.command()
+def demo(
+    output: Output = Path("ubl-graph-demo"),
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated noise.")] = 1,
+    figures: Figures = True,
+) -> None:
+    """Simulate an AUV survey over one beacon, smooth it, and compare with dead reckoning.
+
+    Example: ubl-graph demo -o demo-out
+    """
+    from ubl_graph.baselines.dead_reckoning import dead_reckoning
+    from ubl_graph.evaluation import errors_of, evaluate
+    from ubl_graph.sim import demo_survey
+
+    _check_output(output)
+    mission, _ = demo_survey(seed)
+    result = _smooth(mission)
+    _write(result, output, figures)
+    _print_result(result)
+    reckoned = dead_reckoning(mission)
+    rows: dict[str, Errors] = {}
+    for segment in mission.segments:
+        assert segment.reference is not None
+        rows["dead reckoning"] = errors_of(reckoned[segment.name], segment.reference)
+        rows["smoothed"] = evaluate(result)[segment.name]
+    _print_errors(rows)
+
+
+def main() -> None:
+    """Entry point: every error made on purpose becomes one line and exit code 2."""
+    try:
+        app(standalone_mode=True)
+    except UblGraphError as error:
+        # One line whatever a name in it may hold.
+        text = " ".join(str(error).split())
+        typer.echo(f"ubl-graph: {text}", err=True)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        typer.echo("ubl-graph: interrupted", err=True)
+        sys.exit(130)
+
+
+def _smooth(mission: Mission) -> Result:
+    from ubl_graph.smoother import smooth as run
+
+    with _progress(mission.name) as report:
+        return run(mission, report)
+
+
+def _write(result: Result, folder: Path, figures: bool) -> None:
+    from ubl_graph.io.result_files import write_result
+
+    write_result(result, folder, figures)
+    typer.echo(f"written to {folder}")
+
+
+def _check_output(folder: Path) -> None:
+    from ubl_graph.io.result_files import check_folder
+
+    check_folder(folder)
+
+
+@contextmanager
+def _progress(name: str) -> Generator[Report]:
+    """A bar on a terminal's standard error, shown only if the work takes longer than a second."""
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.fields[stage]}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+    )
+    bar = Progress(*columns, console=console, transient=True)
+    begin = time.monotonic()
+    task = bar.add_task(name, total=1.0, stage="")
+
+    def report(stage: str, done: float) -> None:
+        bar.update(task, completed=done, stage=f"{name} {stage}".strip())
+        if console.is_terminal and not bar.live.is_started and time.monotonic() - begin > PATIENCE:
+            bar.start()
+
+    try:
+        yield report
+    finally:
+        if bar.live.is_started:
+            bar.stop()
+
+
+def _print_result(result: Result) -> None:
+    from ubl_graph.evaluation import Errors, evaluate
+
+    typer.echo(f"status: {result.status}" + (f" ({result.reason})" if result.reason else ""))
+    for warning in result.warnings:
+        typer.echo(f"warning: {warning}", err=True)
+    compared = evaluate(result)
+    table = _table("segment", "nodes", "pings", "down-weighted", "median sd, m", "status")
+    for segment in result.segments:
+        sd = segment.trajectory.covariance[:, [0, 1], [0, 1]].max(axis=1) ** 0.5
+        residuals = segment.residuals
+        table.add_row(
+            segment.name or "-",
+            str(len(segment.trajectory.t)),
+            "0" if residuals is None else str(len(residuals)),
+            "0" if residuals is None else str(int(residuals.down_weighted.sum())),
+            f"{sorted(sd)[len(sd) // 2]:.2f}",
+            segment.status,
+        )
+    _show(table)
+    if compared:
+        _print_errors({"against the reference": Errors.joined(compared.values())})
+
+
+def _print_errors(rows: dict[str, Errors]) -> None:
+    table = _table(
+        "", "horizontal rmse, m", "interior rmse, m", "largest, m", "mean NEES (2 is true)"
+    )
+    for name, errors in rows.items():
+        found = errors.summary()
+        table.add_row(
+            name,
+            _number(found["horizontal_rmse_m"], "{:.2f}"),
+            _number(found["interior_horizontal_rmse_m"], "{:.2f}"),
+            f"{errors.horizontal.max():.2f}",
+            _number(found["interior_mean_nees_2dof"], "{:.1f}"),
+        )
+    _show(table)
+
+
+def _number(value: float | None, form: str) -> str:
+    return "-" if value is None else form.format(value)
+
+
+def _table(*columns: str) -> Table:
+    table = Table(box=None, pad_edge=False, header_style="")
+    for i, column in enumerate(columns):
+        table.add_column(column, justify="left" if i == 0 else "right", no_wrap=True)
+    return table
+
+
+def _show(table: Any) -> None:
+    # A pipe has no width; 120 keeps the rows whole.
+    console = Console()
+    Console(width=None if console.is_terminal else 120, highlight=False).print(table)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,286 @@
+"""Writing a Result into a folder: tables, JSON, the resolved mission, figures.
+
+All files are written beside the target first and moved in at the end, so that a failure leaves
+nothing half-written.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import platform
+import shutil
+import tempfile
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ubl_graph.arrays import FloatArray
+from ubl_graph.errors import DataError
+from ubl_graph.evaluation import Errors, evaluate
+from ubl_graph.io.resolved import resolved
+from ubl_graph.result import RangeResiduals, Result, SegmentResult, SlowState
+
+#: Columns of trajectory.csv; docs/outputs.md says what they hold.
+TRAJECTORY_COLUMNS = (
+    *("segment", "t", "east", "north", "up", "v_east", "v_north", "v_up"),
+    *("sd_east", "sd_north", "sd_up", "cov_east_north"),
+)
+RESIDUAL_COLUMNS = (
+    *("segment", "kind", "beacon", "t_transmit", "t_receive", "travel_time"),
+    *("residual", "sigma", "weight", "direct_ray"),
+)
+#: Components of the slow states as slow_states.csv names them.
+SLOW_COMPONENTS = {
+    "sound_speed": ("sound_speed_log_factor",),
+    "clock_offset": ("clock_offset",),
+    "clock_drift": ("clock_drift",),
+    "current": ("current_east", "current_north"),
+}
+
+
+def write_result(result: Result, folder: str | Path, figures: bool = True) -> list[Path]:
+    """Write everything that `ubl-graph smooth` leaves behind.
+
+    Parameters
+    ----------
+    result : Result
+        What to write.
+    folder : path
+        Made where it is missing. Files of the same names in it are replaced, others stay.
+    figures : bool
+        Whether to draw figures (PNG).
+
+    Returns
+    -------
+    list of Path
+        The files, in the order written.
+
+    Raises
+    ------
+    DataError
+        Where the folder cannot be made or written to; then nothing is left behind.
+    """
+    folder = Path(folder)
+    with _staged(folder) as stage:
+        _write_rows(stage / "trajectory.csv", TRAJECTORY_COLUMNS, _trajectory_rows(result))
+        if result.residuals is not None:
+            _write_rows(stage / "residuals.csv", RESIDUAL_COLUMNS, _residual_rows(result))
+        if any(s.slow for s in result.segments):
+            columns, rows = _slow_table(result)
+            _write_rows(stage / "slow_states.csv", columns, rows)
+        _write_json(stage / "result.json", summary(result))
+        _write_json(stage / "mission.json", resolved(result.mission))
+        if figures:
+            from ubl_graph import plots  # matplotlib is heavy: only who draws pays for it
+
+            plots.save_all(result, stage)
+        names = sorted(p.name for p in stage.iterdir())
+    return [folder / name for name in names]
+
+
+def check_folder(folder: str | Path) -> None:
+    """Refuse an output that is a file (before hours of work, not after); write nothing.
+
+    Raises
+    ------
+    DataError
+        Where `folder` exists and is no folder.
+    """
+    folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise DataError("the output is a file, not a folder", "name a folder", file=folder)
+
+
+def summary(result: Result) -> dict[str, Any]:
+    """What result.json holds, as a plain dict; docs/outputs.md explains each key."""
+    residuals = result.residuals
+    errors = evaluate(result)
+    chi_square = sum({id(s): s.chi_square for s in _problems(result)}.values())
+    dof = sum(s.degrees_of_freedom for s in _problems(result))
+    content: dict[str, Any] = {
+        "mission": result.mission.name,
+        "status": result.status,
+        "reason": result.reason,
+        "warnings": list(result.warnings),
+        "cost": sum(s.cost for s in _problems(result)),
+        "iterations": sum(s.iterations for s in _problems(result)),
+        "chi_square_per_dof": chi_square / max(dof, 1),
+        "pings": {} if residuals is None else _ping_counts(residuals),
+        "beacons": {
+            name: {"enu": b.value.tolist(), "sigma_enu": b.sigma.tolist()}
+            for name, b in result.beacons.items()
+        },
+        "shared_states": {
+            name: {"value": s.value.tolist(), "sigma": s.sigma.tolist()}
+            for name, s in result.shared.items()
+        },
+        "segments": [_segment_summary(s, errors.get(s.name)) for s in result.segments],
+        "wall_times_s": {name: round(t, 4) for name, t in result.wall_times.items()},
+        "versions": versions(),
+    }
+    if errors:
+        content["reference"] = Errors.joined(errors.values()).summary()
+    return content
+
+
+def versions() -> dict[str, str]:
+    """Versions of ubl_graph, of what it stands on, and of Python."""
+    found: dict[str, str] = {"python": platform.python_version()}
+    for name in ("ubl-graph", "gtsam", "numpy", "scipy"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def _problems(result: Result) -> list[SegmentResult]:
+    """One segment of each problem: segments solved together share cost and counts."""
+    shared = result.mission.options.estimate_beacons or bool(result.shared)
+    return list(result.segments[:1] if shared else result.segments)
+
+
+def _segment_summary(segment: SegmentResult, errors: Errors | None) -> dict[str, Any]:
+    sd = np.sqrt(np.einsum("nii->ni", segment.trajectory.covariance))
+    content: dict[str, Any] = {
+        "name": segment.name,
+        "status": segment.status,
+        "reason": segment.reason,
+        "nodes": len(segment.trajectory.t),
+        "t_first": float(segment.trajectory.t[0]),
+        "t_last": float(segment.trajectory.t[-1]),
+        "cost": segment.cost,
+        "iterations": segment.iterations,
+        "chi_square_per_dof": segment.chi_square / max(segment.degrees_of_freedom, 1),
+        "median_sd_m": dict(zip(("east", "north", "up"), np.median(sd, axis=0), strict=True)),
+        "slow_states": {name: _slow_summary(s) for name, s in segment.slow.items()},
+    }
+    if errors is not None:
+        content["reference"] = errors.summary()
+    return content
+
+
+def _slow_summary(state: SlowState) -> dict[str, Any]:
+    return {
+        "mean": state.value.mean(axis=0).tolist(),
+        "first": state.value[0].tolist(),
+        "last": state.value[-1].tolist(),
+        "median_sigma": np.median(state.sigma, axis=0).tolist(),
+    }
+
+
+def _ping_counts(residuals: RangeResiduals) -> dict[str, dict[str, int]]:
+    return {
+        str(name): {
+            "used": int((residuals.beacon == name).sum()),
+            "down_weighted": int((residuals.down_weighted & (residuals.beacon == name)).sum()),
+        }
+        for name in np.unique(residuals.beacon)
+    }
+
+
+def _trajectory_rows(result: Result) -> Iterator[list[str]]:
+    for segment in result.segments:
+        track = segment.trajectory
+        sd = np.sqrt(np.einsum("nii->ni", track.covariance))
+        table = np.column_stack([track.position, track.velocity, sd, track.covariance[:, 0, 1]])
+        for t, row in zip(track.t, table, strict=True):
+            yield [segment.name, _time(t), *_numbers(row)]
+
+
+def _residual_rows(result: Result) -> Iterator[list[str]]:
+    for segment in result.segments:
+        r = segment.residuals
+        if r is None:
+            continue
+        for i in range(len(r)):
+            yield [
+                segment.name,
+                str(r.kind[i]),
+                str(r.beacon[i]),
+                _time(r.t_transmit[i]),
+                _time(r.t_receive[i]),
+                f"{r.travel_time[i]:.9f}",
+                f"{r.residual[i]:.9f}",
+                f"{r.sigma[i]:.3e}",
+                f"{r.weight[i]:.4f}",
+                "yes" if r.found[i] else "no",
+            ]
+
+
+def _slow_table(result: Result) -> tuple[list[str], Iterator[list[str]]]:
+    names = list(dict.fromkeys(name for s in result.segments for name in s.slow))
+    components = [c for name in names for c in SLOW_COMPONENTS[name]]
+
+    def rows() -> Iterator[list[str]]:
+        for segment in result.segments:
+            states = [segment.slow[name] for name in names]
+            values = np.concatenate([s.value for s in states], axis=1)
+            sigmas = np.concatenate([s.sigma for s in states], axis=1)
+            for t, value, sigma in zip(segment.trajectory.t, values, sigmas, strict=True):
+                yield [segment.name, _time(t), *(f"{v:.6e}" for v in (*value, *sigma))]
+
+    return ["segment", "t", *components, *(f"sd_{c}" for c in components)], rows()
+
+
+def _time(t: float) -> str:
+    """All digits of a stamp: what reads it back finds the very same float."""
+    return repr(float(t))
+
+
+def _numbers(row: FloatArray) -> list[str]:
+    # A micrometre, and never "-0.000000".
+    return [f"{v + 0.0:.6f}" if abs(v) >= 5e-7 else "0.000000" for v in row]
+
+
+def _write_rows(path: Path, columns: Iterable[str], rows: Iterable[list[str]]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(rows)
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    path.write_text(json.dumps(_finite(content), indent=2) + "\n", encoding="utf-8")
+
+
+def _finite(value: Any) -> Any:
+    """JSON knows no infinity and no NaN: null stands for them."""
+    if isinstance(value, dict):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(v) for v in value]
+    if isinstance(value, (float, np.floating)):
+        return float(value) if np.isfinite(value) else None
+    return value.item() if isinstance(value, np.generic) else value
+
+
+@contextmanager
+def _staged(folder: Path) -> Generator[Path]:
+    """A folder beside the target, moved into it when all went well, removed when not."""
+    check_folder(folder)
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        stage = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise DataError(
+            f"the output folder cannot be made ({reason})",
+            "name a folder you may write",
+            file=folder,
+        ) from error
+    try:
+        yield stage
+        if folder.exists():
+            for path in stage.iterdir():
+                path.replace(folder / path.name)
+        else:
+            stage.chmod(0o755)
+            stage.replace(folder)
+    finally:
+        shutil.rmtree(stage, ignore_errors=True)

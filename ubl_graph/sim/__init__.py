@@ -1,0 +1,50 @@
+"""Simulation: true tracks, sensors that look at them, and missions made of both.
+
+>>> from ubl_graph.sim import straight_pass
+>>> mission, truth = straight_pass(seed=1)
+>>> mission.beacon_names
+('B1', 'B2', 'B3', 'B4')
+>>> truth.position([0.0, 60.0]).tolist()
+[[-200.0, -40.0, -60.0], [-110.0, -10.0, -60.0]]
+"""
+
+from ubl_graph.sim.missions import demo_survey, straight_pass
+from ubl_graph.sim.sensors import (
+    Clock,
+    DvlErrors,
+    Sea,
+    ahrs,
+    dvl,
+    fixes,
+    one_way_pings,
+    pressure,
+    two_way_pings,
+)
+from ubl_graph.sim.tracks import (
+    Truth,
+    constant_acceleration,
+    constant_velocity,
+    lawn_mower,
+    sampled,
+    wander,
+)
+
+__all__ = [
+    "Clock",
+    "DvlErrors",
+    "Sea",
+    "Truth",
+    "ahrs",
+    "constant_acceleration",
+    "constant_velocity",
+    "demo_survey",
+    "dvl",
+    "fixes",
+    "lawn_mower",
+    "one_way_pings",
+    "pressure",
+    "sampled",
+    "straight_pass",
+    "two_way_pings",
+    "wander",
+]
