@@ -87,11 +87,7 @@ def free_swimmer(seed: int, options: Options) -> tuple[Mission, Truth]:
 
 
 WNOA = Options(loss="none", vertical_acceleration_psd=1e-4)
-#: Shorter windows than the default's 80 s: a start found at constant velocity may end some hundred
-#: metres off an accelerated track (test_start.py), and here covariances are judged, not starts.
-WNOJ = Options(
-    motion="constant_acceleration", loss="none", vertical_jerk_psd=1e-7, start_window=30.0
-)
+WNOJ = Options(motion="constant_acceleration", loss="none", vertical_jerk_psd=1e-7)
 
 
 @cache

@@ -213,10 +213,6 @@ def test_dvl_with_its_errors(errors: DvlErrors):
         np.testing.assert_allclose(found, errors.misalignment, atol=2e-6)
 
 
-@pytest.mark.xfail(
-    reason="AttitudeTrack.lever_rate halves the rate at the first and last attitude record: it "
-    "divides a one-sided difference by two steps"
-)
 def test_dvl_with_a_lever_arm_as_long_as_the_attitude():
     """Attitude begins and ends with the DVL: the velocity at the ends is as good as elsewhere."""
     segment = Segment(

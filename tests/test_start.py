@@ -200,17 +200,7 @@ def accelerating(seed: int) -> tuple[Mission, Truth]:
         (37, 30.0),
         (141, 30.0),
         (190, 30.0),
-        *[
-            pytest.param(
-                seed,
-                80.0,
-                marks=pytest.mark.xfail(
-                    reason="windows fit a constant velocity whatever the motion prior: the start "
-                    "is up to 300 m off, and the solver stays in a local minimum without a warning"
-                ),
-            )
-            for seed in (7, 190)
-        ],
+        *[(seed, 80.0) for seed in (7, 37, 141, 190)],
     ],
 )
 def test_no_start_needed_where_the_vehicle_accelerates(seed: int, window: float):

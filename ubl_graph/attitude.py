@@ -49,4 +49,8 @@ class AttitudeTrack:
         """Velocity of a lever arm's tip by rotation, (M, 3), m/s, by central difference."""
         if arm.is_zero:
             return np.zeros((len(times), 3))
-        return (self.lever(arm, times + step) - self.lever(arm, times - step)) / (2.0 * step)
+        # The attitude is held beyond its records: no difference may reach out there.
+        before, after = (np.clip(t, self.t[0], self.t[-1]) for t in (times - step, times + step))
+        span = (after - before)[:, None]
+        moved = self.lever(arm, after) - self.lever(arm, before)
+        return np.divide(moved, span, out=np.zeros_like(moved), where=span > 0.0)

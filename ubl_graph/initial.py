@@ -17,13 +17,16 @@ from scipy.interpolate import CubicHermiteSpline
 
 from ubl_graph.arrays import FloatArray
 from ubl_graph.factors.odometry import Preintegration
-from ubl_graph.graph import FREE_POSITION, SegmentModel
+from ubl_graph.graph import FREE_ACCELERATION, FREE_POSITION, SegmentModel
 from ubl_graph.layout import Chain, Layout
 from ubl_graph.mission import Mission, Segment, Start
-from ubl_graph.trajectory import process_noise
+from ubl_graph.nodes import order_of
+from ubl_graph.trajectory import interpolation_variance, process_noise
 from ubl_graph.windows import (
+    ACCELERATION,
     CLOCK,
     EAST_NORTH_UP,
+    PARAMETERS,
     SCALE,
     VELOCITY,
     Hypotheses,
@@ -36,6 +39,8 @@ from ubl_graph.windows import (
 WINDOW_RANGES = 24
 #: Ranges that a window should hold before it is worth fitting; it is made longer until it does.
 FEWEST_RANGES = 6
+#: Speeds are searched around zero within this, m/s.
+WINDOW_SPEED = 10.0
 #: With odometry the shape of the track is known, so a window may be so many times longer.
 ODOMETRY_WINDOWS = 5.0
 #: What dead reckoning may be off by, as a share of the way and at the least, m.
@@ -58,8 +63,8 @@ class Track:
 
     Attributes
     ----------
-    position, velocity : array, shape (N, 3)
-        At the nodes, m and m/s.
+    position, velocity, acceleration : array, shape (N, 3)
+        At the nodes; m, m/s, m/s^2.
     scale, clock : array, shape (N,)
         Log scale of the travel times, clock offset (s).
     cost : float
@@ -68,6 +73,7 @@ class Track:
 
     position: FloatArray
     velocity: FloatArray
+    acceleration: FloatArray
     scale: FloatArray
     clock: FloatArray
     cost: float
@@ -127,6 +133,7 @@ def place(layout: Layout, chain: Chain, track: Track, x: FloatArray) -> None:
     values = {
         "position": track.position,
         "velocity": track.velocity,
+        "acceleration": track.acceleration,
         "sound_speed": track.scale[:, None],
         "clock_offset": track.clock[:, None],
     }
@@ -256,7 +263,7 @@ def _fit_window(
 
 def _window_prior(mission: Mission, segment: Segment, reckoning: _DeadReckoning) -> Prior:
     options = mission.options
-    mean, sigma = np.zeros(8), np.empty(8)
+    mean, sigma = np.zeros(PARAMETERS), np.empty(PARAMETERS)
     if mission.beacons:
         mean[:2] = np.mean([b.position[:2] for b in mission.beacons], axis=0)
     sigma[:2] = FREE_POSITION
@@ -268,11 +275,16 @@ def _window_prior(mission: Mission, segment: Segment, reckoning: _DeadReckoning)
         else:
             sigma[2] = FREE_POSITION
         sigma[5] = 0.5
-    speed = options.speed_sigma
+    speed = min(options.speed_sigma, WINDOW_SPEED)
     if reckoning.odometry is not None:
         water = reckoning.odometry is not reckoning.model.bottom
         speed = np.hypot(ODOMETRY_SPEED, options.current_sigma if water else 0.0)
     sigma[3:5] = speed
+    # Only the constant-acceleration prior lets a window bend; odometry knows the bends already.
+    bends = order_of(options) == 3 and reckoning.odometry is None
+    sigma[ACCELERATION] = FREE_ACCELERATION if bends else 1e-9
+    if reckoning.depth is not None:
+        sigma[8] = 1e-9
     sigma[SCALE] = mission.sound_speed_sigma + 1e-6 if options.estimate_sound_speed else 1e-6
     sigma[CLOCK] = options.clock_offset_sigma + 1e-9
     return Prior(mean, sigma)
@@ -282,8 +294,10 @@ def _model_sigma(mission: Mission, reckoning: _DeadReckoning, begin: float, end:
     """What the true motion may deviate from the window's model by, m."""
     span = end - begin
     if reckoning.odometry is None:
-        # Bridge variance of the constant-velocity prior in the middle of the window.
-        return float(np.sqrt(mission.options.acceleration_psd * span**3 / 192.0)) + 0.1
+        # What the motion prior does between the window's ends.
+        order = order_of(mission.options)
+        variance = interpolation_variance(order, np.array(span), np.array(0.5))
+        return float(np.sqrt(mission.options.horizontal_psd * variance)) + 0.1
     way = np.linalg.norm(
         np.diff(reckoning.offset(np.linspace(begin, end, 20))[:, :2], axis=0), axis=1
     )
@@ -336,13 +350,15 @@ def _step_cost(
     half = 0.5 * (b.t - a.t)
     carried = [_carried(a, half), _carried(b, -half)]
     gap = carried[0][0][:, None, :] - carried[1][0][None, :, :]
-    wander = np.zeros((8, 8))
+    wander = np.zeros((PARAMETERS, PARAMETERS))
     if reckoning.odometry is None:
-        noise = 2.0 * mission.options.acceleration_psd * process_noise(2, half)[0]
+        order = order_of(mission.options)
+        noise = 2.0 * mission.options.horizontal_psd * process_noise(order, half)[0]
     else:
         noise = np.diag([ODOMETRY_SLACK**2 + (ODOMETRY_SPEED * half) ** 2, ODOMETRY_SPEED**2])
     for axis in range(3):
-        wander[np.ix_([axis, 3 + axis], [axis, 3 + axis])] = noise
+        states = axis + 3 * np.arange(len(noise))
+        wander[np.ix_(states, states)] = noise
     wander[SCALE, SCALE] = (1e-4) ** 2
     wander[CLOCK, CLOCK] = (1e-4 + mission.options.clock_drift_sigma * half) ** 2
     spread = carried[0][1][:, None] + carried[1][1][None, :] + wander
@@ -351,8 +367,9 @@ def _step_cost(
 
 def _carried(window: Hypotheses, dt: float) -> tuple[FloatArray, FloatArray]:
     """Parameters and covariance of a window's answers `dt` seconds from its middle."""
-    f = np.eye(8)
-    f[EAST_NORTH_UP, VELOCITY] = dt * np.eye(3)
+    f = np.eye(PARAMETERS)
+    f[EAST_NORTH_UP, VELOCITY] = f[VELOCITY, ACCELERATION] = dt * np.eye(3)
+    f[EAST_NORTH_UP, ACCELERATION] = 0.5 * dt**2 * np.eye(3)
     return window.parameters @ f.T, f @ window.covariance @ f.T
 
 
@@ -368,8 +385,10 @@ def _start_sigmas(window: Hypotheses, reckoning: _DeadReckoning, start: Start) -
     dt = start.t - window.t
     parameters, covariance = _carried(window, dt)
     position = parameters[:, :2] + reckoning.offset(np.array([start.t]))[0, :2]
-    wander = reckoning.mission.options.acceleration_psd * abs(dt) ** 3 / 3.0
-    if reckoning.odometry is not None:
+    if reckoning.odometry is None:
+        options = reckoning.mission.options
+        wander = options.horizontal_psd * process_noise(order_of(options), abs(dt) + 1e-9)[0, 0, 0]
+    else:
         wander = (ODOMETRY_SPEED * dt) ** 2
     gap = position - [start.east, start.north]
     spread = covariance[:, :2, :2] + (start.sigma**2 + wander) * np.eye(2)
@@ -389,17 +408,20 @@ def _track(
     offset = reckoning.offset(model.t)
     inner = np.clip(model.t, middles[0], middles[-1])
     beyond = (model.t - inner)[:, None]
+    bend = np.stack([np.interp(inner, middles, a) for a in chosen[:, ACCELERATION].T], axis=1)
     if len(windows) == 1:
         position, velocity = chosen[0, EAST_NORTH_UP], chosen[0, VELOCITY]
     else:
         spline = CubicHermiteSpline(middles, chosen[:, EAST_NORTH_UP], chosen[:, VELOCITY])
         position, velocity = spline(inner), spline(inner, 1)
-    position = position + velocity * beyond + offset
+    position = position + velocity * beyond + 0.5 * bend * beyond**2 + offset
+    velocity = velocity + bend * beyond
     if len(model.t) > 1:
         velocity = velocity + np.gradient(offset, model.t, axis=0)
     return Track(
         position,
-        np.broadcast_to(velocity, position.shape),
+        velocity,
+        bend,
         np.interp(model.t, middles, chosen[:, SCALE]),
         np.interp(model.t, middles, chosen[:, CLOCK]),
         cost,

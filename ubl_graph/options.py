@@ -44,8 +44,9 @@ class Options:
     vertical_jerk_psd: float | None = None
     """The same for the vertical; left out, it equals the horizontal one."""
 
-    speed_sigma: float = 10.0
-    """What is known of the velocity before any measurement: zero within this, m/s."""
+    speed_sigma: float = 100.0
+    """What is known of the first velocity before any measurement: zero within this, m/s. So wide
+    that it pulls no estimate by more than micrometres."""
 
     loss: Loss = "cauchy"
     """Robust loss on the acoustic ranges; its width gives 95 % efficiency on normal noise."""
@@ -82,8 +83,8 @@ class Options:
     clock_offset_sigma: float = 1.0
     """Standard deviation of the clock offset (vehicle - beacon) at the start, s."""
 
-    clock_drift_sigma: float = 1e-5
-    """Standard deviation of the clock drift at the start, s/s (10 ppm, a bare crystal)."""
+    clock_drift_sigma: float = 1e-4
+    """Standard deviation of the clock drift at the start, s/s: ten times a bare crystal's."""
 
     clock_walk: float = 1e-7
     """Random walk of the clock offset beyond its drift, s per sqrt(s)."""

@@ -25,6 +25,10 @@ from ubl_graph.solve.marginals import Marginals
 
 #: A second track counts as no worse where its cost is higher by less than this: odds of 20 to 1.
 AMBIGUOUS_COST = 3.0
+#: Outliers are a few per cent; where a fifth of the pings disagree, something else is wrong.
+SUSPICIOUS_SHARE = 0.2
+#: Sigmas would have to be three times too small to explain this.
+SUSPICIOUS_CHI_SQUARE = 9.0
 
 #: Called with what is being done and how far the whole is, 0 to 1.
 Progress = Callable[[str, float], None]
@@ -72,9 +76,38 @@ def smooth(mission: Mission, progress: Progress | None = None) -> Result:
         results, unknowns = _smooth_group(work, group)
         segments += results
         shared |= unknowns
+    for segment in segments:
+        _judge(work, segment)
     beacons = beacons_of(mission, shared)
     shared = {name: s for name, s in shared.items() if not name.startswith("beacon ")}
     return Result(mission, tuple(segments), beacons, shared, tuple(work.warnings), work.wall_times)
+
+
+def _judge(work: _Work, segment: SegmentResult) -> None:
+    """Warn of what does not stop a solver but should stop a user."""
+    residuals = segment.residuals
+    if residuals is not None:
+        share = float(residuals.down_weighted.mean())
+        if share > SUSPICIOUS_SHARE:
+            work.warn(
+                segment.name,
+                f"{100 * share:.0f} % of the pings are down-weighted; check beacons, sound speed, "
+                "sigmas and the start before trusting this track",
+            )
+        blind = int((~residuals.found).sum())
+        if blind:
+            work.warn(
+                segment.name,
+                f"{blind} pings have no direct ray at the estimate; a straight line stands in "
+                "(column direct_ray of residuals.csv)",
+            )
+    ratio = segment.chi_square / max(segment.degrees_of_freedom, 1)
+    if ratio > SUSPICIOUS_CHI_SQUARE:
+        work.warn(
+            segment.name,
+            f"chi-square per degree of freedom is {ratio:.1f}: the data contradict each other or "
+            "their sigmas are too small",
+        )
 
 
 def _smooth_group(

@@ -1,11 +1,12 @@
 """Fits of one short window of pings from many starts at once.
 
-In a window the vehicle moves along what dead reckoning says plus a constant velocity,
+In a window the vehicle moves along what dead reckoning says plus a constant velocity or, where
+the motion prior is that of constant acceleration, a constant acceleration,
 
-    p(t) = d(t) + p0 + v (t - t_mid),
+    p(t) = d(t) + p0 + v s + a s^2 / 2,  s = t - t_mid,
 
 with d(t) the DVL's displacement (zero without one) and, where depth is known, its up in place of
-d's. Unknown are p0, v, the log scale g of the travel times and the clock offset: eight numbers.
+d's. Unknown are p0, v, a, the log scale g of the travel times and the clock offset.
 Gauss-Newton with Marquardt's damping runs from many starts side by side, all in one array, along
 straight rays; what converges to distinct places are the window's hypotheses.
 """
@@ -20,8 +21,9 @@ from ubl_graph.acoustics import SoundSpeedProfile, straight
 from ubl_graph.arrays import BoolArray, FloatArray, IntArray, frozen
 
 #: Columns of a fit's parameters.
-EAST_NORTH_UP, VELOCITY, SCALE, CLOCK = slice(0, 3), slice(3, 6), 6, 7
-PARAMETERS = 8
+EAST_NORTH_UP, VELOCITY, ACCELERATION = slice(0, 3), slice(3, 6), slice(6, 9)
+SCALE, CLOCK = 9, 10
+PARAMETERS = 11
 
 #: Directions around a beacon in which starts are laid on its range circle.
 AZIMUTHS = 16
@@ -94,9 +96,10 @@ class Hypotheses:
     ----------
     t : float
         Middle of the window, s.
-    parameters : array, shape (H, 8)
-        East, north, up (m), velocity (m/s), log scale, clock offset (s) at `t`.
-    covariance : array, shape (H, 8, 8)
+    parameters : array, shape (H, 11)
+        East, north, up (m), velocity (m/s), acceleration (m/s^2), log scale, clock offset (s)
+        at `t`.
+    covariance : array, shape (H, 11, 11)
         Of the parameters.
     cost : array, shape (H,)
         Cauchy cost of ranges and fixes, and half the prior's square.
@@ -131,10 +134,10 @@ def fit(
     t_mid : float
         Reference time of the parameters, s.
     prior : Prior
-        Over the eight parameters.
+        Over the parameters.
     model_sigma : float
         What the vehicle's real motion may deviate from the window's by, m.
-    extra : array, shape (K, 8), optional
+    extra : array, shape (K, 11), optional
         Further starts (from the neighbouring window).
 
     Returns
@@ -150,7 +153,7 @@ def fit(
 
 
 def _starts(profile: SoundSpeedProfile, s: Sightings, prior: Prior) -> FloatArray:
-    """Parameters on the range circles of a few pings, and on the fixes; shape (S, 8)."""
+    """Parameters on the range circles of a few pings, and on the fixes; shape (S, 11)."""
     starts: list[FloatArray] = []
     for row in np.unique(np.linspace(0, len(s.t) - 1, 3).astype(int)) if len(s.t) else []:
         speed = float(profile.harmonic_mean(-s.offset[row, 0, 2], -s.beacon[row, 2]))
@@ -193,13 +196,14 @@ class _System:
         self.profile, self.s, self.prior = profile, s, prior
         self.dt = s.t - t_mid
         self.fix_dt = s.fix_t - t_mid
+        self.bend, self.fix_bend = 0.5 * self.dt**2, 0.5 * self.fix_dt**2
         slowness = s.share.sum(axis=1) / 1500.0
         self.inverse = 1.0 / np.hypot(s.sigma, slowness * model_sigma)
         self.fix_inverse = 1.0 / np.hypot(s.fix_sigma, model_sigma)
         self.legs_beacon = np.repeat(s.beacon[:, None, :], 2, axis=1)
 
     def evaluate(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Cost (S,), gradient (S, 8) and Gauss-Newton Hessian (S, 8, 8)."""
+        """Cost (S,), gradient (S, 11) and Gauss-Newton Hessian (S, 11, 11)."""
         residual, jacobian = self._ranges(theta)
         fixes, fix_jacobian = self._fixes(theta)
         residual = np.concatenate([residual, fixes], axis=1)
@@ -219,6 +223,7 @@ class _System:
         position = (
             theta[:, None, None, EAST_NORTH_UP]
             + theta[:, None, None, VELOCITY] * self.dt[None, :, :, None]
+            + theta[:, None, None, ACCELERATION] * self.bend[None, :, :, None]
             + s.offset[None]
         )
         beacon = np.broadcast_to(self.legs_beacon, position.shape)
@@ -231,6 +236,7 @@ class _System:
         jacobian = np.empty((n_starts, m, PARAMETERS))
         jacobian[..., EAST_NORTH_UP] = slopes.sum(axis=2)
         jacobian[..., VELOCITY] = (slopes * self.dt[..., None]).sum(axis=2)
+        jacobian[..., ACCELERATION] = (slopes * self.bend[..., None]).sum(axis=2)
         jacobian[..., SCALE] = total
         jacobian[..., CLOCK] = s.clock
         return residual, jacobian * self.inverse[:, None]
@@ -241,6 +247,7 @@ class _System:
         position = (
             theta[:, None, EAST_NORTH_UP]
             + theta[:, None, VELOCITY] * self.fix_dt[:, None]
+            + theta[:, None, ACCELERATION] * self.fix_bend[:, None]
             + s.fix_offset
         )
         residual = (position - s.fix) * self.fix_inverse
@@ -248,6 +255,7 @@ class _System:
         axis = np.arange(3)
         jacobian[:, axis, axis] = self.fix_inverse
         jacobian[:, axis, 3 + axis] = self.fix_inverse * self.fix_dt[:, None]
+        jacobian[:, axis, 6 + axis] = self.fix_inverse * self.fix_bend[:, None]
         rows = jacobian.reshape(1, 3 * f, PARAMETERS)
         return residual.reshape(n_starts, 3 * f), np.repeat(rows, n_starts, axis=0)
 
