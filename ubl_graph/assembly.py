@@ -29,6 +29,7 @@ def assemble_segment(
     chain: Chain,
     model: SegmentModel,
     rival: str | None,
+    number: int,
 ) -> SegmentResult:
     """Everything that a user reads of one segment.
 
@@ -40,6 +41,8 @@ def assemble_segment(
         The segment's nodes and records.
     rival : str or None
         What to say of another track that fits as well.
+    number : int
+        Of the problem among those of the mission.
     """
     layout = problem.layout
     trajectory = Trajectory(
@@ -52,7 +55,8 @@ def assemble_segment(
     )
     slow = {name: _slow_state(problem, solution, marginals, chain, name) for name, _ in layout.slow}
     residuals = _range_residuals(problem, solution, chain, model)
-    status, reason = _status(solution, trajectory, residuals, rival)
+    limit = _unobserved_sigma(residuals, slow.get("clock_offset"))
+    status, reason = _status(solution, trajectory, limit, rival)
     chi_square, dof = _chi_square(problem, solution)
     return SegmentResult(
         chain.name,
@@ -61,6 +65,7 @@ def assemble_segment(
         residuals,
         status,
         reason,
+        number,
         solution.cost,
         solution.iterations,
         chi_square,
@@ -118,18 +123,21 @@ def _range_residuals(
     return RangeResiduals.joined(parts) if parts else None
 
 
+def _unobserved_sigma(residuals: RangeResiduals | None, clock: SlowState | None) -> float:
+    """Standard deviation (m) beyond which a track counts as not observed."""
+    if residuals is None:
+        return UNOBSERVED_SIGMA
+    one_way = residuals.kind == "one_way"
+    offset = 0.0 if clock is None else float(np.median(clock.value))
+    flight = np.where(one_way, residuals.travel_time - offset, residuals.travel_time / 2.0)
+    return UNOBSERVED_SHARE * 1500.0 * float(np.median(np.abs(flight)))
+
+
 def _status(
-    solution: Solution,
-    trajectory: Trajectory,
-    residuals: RangeResiduals | None,
-    rival: str | None,
+    solution: Solution, trajectory: Trajectory, limit: float, rival: str | None
 ) -> tuple[Status, str]:
     values, vectors = np.linalg.eigh(trajectory.covariance)
     sigma = np.sqrt(values[:, -1])
-    limit = UNOBSERVED_SIGMA
-    if residuals is not None:
-        legs = np.where(residuals.kind == "two_way", 2.0, 1.0)
-        limit = UNOBSERVED_SHARE * 1500.0 * float(np.median(np.abs(residuals.travel_time) / legs))
     if np.median(sigma) > limit:
         node = int(np.argsort(sigma)[len(sigma) // 2])
         return "unobservable", (
@@ -139,7 +147,7 @@ def _status(
     if rival is not None:
         return "unobservable", rival
     if not solution.converged:
-        return "not converged", f"no rest after {solution.iterations} iterations"
+        return "not converged", solution.trouble
     return "converged", ""
 
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from ubl_graph.arrays import FloatArray, IntArray
 from ubl_graph.factors.block import Block
+from ubl_graph.factors.loss import RobustLoss
 from ubl_graph.layout import Layout, Variable
 from ubl_graph.problem import Frozen, Problem
 
@@ -128,7 +129,7 @@ class GraphView:
         scratch: FloatArray,
     ) -> Callable[[Any, gtsam.Values, list[FloatArray] | None], FloatArray]:
         rows = slice(row, row + 1)
-        loss = self.problem.loss
+        loss = self.problem.loss if block.robust else RobustLoss("none")
         access = [
             (_READ[v.size], key, slice(v.column, v.column + v.size))
             for v, key in zip(variables, keys, strict=True)
@@ -136,16 +137,26 @@ class GraphView:
         # Range rows touch whole variables, once for each leg that meets them: legs add up.
         legs = [group.reshape(-1, v.size) for group, v in zip(groups, variables, strict=True)]
 
+        own = np.concatenate([np.arange(v.column, v.column + v.size) for v in variables])
+        # The optimiser asks for the error at a trial point and, if it takes it, for the Jacobians
+        # at the same point: what was computed last is kept.
+        last: list[FloatArray] = []
+
         def evaluate(
             _: Any, values: gtsam.Values, jacobians: list[FloatArray] | None
         ) -> FloatArray:
             for read, key, where in access:
                 scratch[where] = read(values, key)
-            r, jacobian = block.evaluate(scratch, held, rows, jacobians is not None)
-            if jacobians is None or jacobian is None:
+            at = scratch[own]
+            if not last or not (last[0] == at).all():
+                r, jacobian = block.evaluate(scratch, held, rows)
+                assert jacobian is not None
+                last[:] = at, r, jacobian[0, 0]
+            _, r, line = last
+            if jacobians is None:
                 return loss.shaped(r)[0]
             root = np.sqrt(loss.weights(r))
-            line = root[0, 0] * jacobian[0, 0]
+            line = root[0, 0] * line
             for j, leg in enumerate(legs):
                 jacobians[j] = line[leg].sum(axis=0, keepdims=True)
             return (root * r)[0]

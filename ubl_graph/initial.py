@@ -113,15 +113,11 @@ def find_starts(mission: Mission, model: SegmentModel) -> Starts:
     segment = model.segment
     windows = [_fit_window(mission, segment, reckoning, *w) for w in _windows(mission, reckoning)]
     own = [window.cost for window in windows]
-    at = _start_window(windows, segment)
-    if at is not None and segment.start is not None:
-        # Cauchy's loss: a start that contradicts the pings must not outweigh them all.
-        q = (_start_sigmas(windows[at], reckoning, segment.start) / START_LIMIT) ** 2
-        own[at] = own[at] + 0.5 * START_LIMIT**2 * np.log1p(q)
     steps = [_step_cost(mission, a, b, reckoning) for a, b in pairwise(windows)]
     ways = _cheapest_ways(own, steps)
     tracks = [_track(model, reckoning, windows, way, cost) for way, cost in ways]
     sigmas = None
+    at = _start_window(windows, segment)
     if at is not None and segment.start is not None:
         sigmas = float(_start_sigmas(windows[at], reckoning, segment.start)[ways[0][0][at]])
     return Starts(tuple(_apart(tracks)), sigmas)
@@ -154,6 +150,8 @@ class _DeadReckoning:
 
     def offset(self, t: FloatArray) -> FloatArray:
         """Displacement since the first node (and the up where depth is known), (M, 3), m."""
+        if not len(t):
+            return np.empty((0, 3))
         if self.odometry is None:
             moved = np.zeros((len(t), 3))
         else:
@@ -201,16 +199,33 @@ class _DeadReckoning:
         return Sightings(t, share, offset, beacon, measured, sigma, clock, *self._fixes())
 
     def _fixes(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        fixes = self.model.segment.position
-        if fixes is None or not len(fixes):
-            return np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3))
-        fixes = fixes[np.argsort(fixes.t)]
-        d = fixes.dimension
-        position, sigma = np.zeros((len(fixes), 3)), np.full((len(fixes), 3), np.inf)
-        position[:, :d] = fixes.position
-        sigma[:, :d] = np.sqrt(np.einsum("mii->mi", fixes.covariances))
-        lever = self.model.attitude.lever(self.mission.vehicle.antenna, fixes.t)
-        return fixes.t, position, self.offset(fixes.t) + lever, sigma
+        """Fixes, the start prior among them: times, positions, displacements, sigmas.
+
+        Their loss in a window is Cauchy's, so a start that contradicts the pings does not
+        outweigh them all; where the pings leave a valley it picks the place in it.
+        """
+        t, position, sigma = [np.empty(0)], [np.empty((0, 3))], [np.empty((0, 3))]
+        lever = [np.empty((0, 3))]
+        start, fixes = self.model.segment.start, self.model.segment.position
+        if start is not None:
+            up = np.inf if start.up is None else start.sigma
+            t.append(np.array([start.t]))
+            position.append(np.array([[start.east, start.north, start.up or 0.0]]))
+            sigma.append(np.array([[start.sigma, start.sigma, up]]))
+            lever.append(np.zeros((1, 3)))
+        if fixes is not None and len(fixes):
+            d = fixes.dimension
+            place, spread = np.zeros((len(fixes), 3)), np.full((len(fixes), 3), np.inf)
+            place[:, :d] = fixes.position
+            spread[:, :d] = np.sqrt(np.einsum("mii->mi", fixes.covariances))
+            t.append(fixes.t)
+            position.append(place)
+            sigma.append(spread)
+            lever.append(self.model.attitude.lever(self.mission.vehicle.antenna, fixes.t))
+        columns = [np.concatenate(c) for c in (t, position, sigma, lever)]
+        order = np.argsort(columns[0], kind="stable")
+        times, places, spreads, levers = (c[order] for c in columns)
+        return times, places, self.offset(times) + levers, spreads
 
 
 def _windows(mission: Mission, reckoning: _DeadReckoning) -> list[tuple[float, float]]:

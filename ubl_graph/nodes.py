@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ubl_graph.arrays import FloatArray
+from ubl_graph.arrays import BoolArray, FloatArray
 from ubl_graph.errors import DataError
 from ubl_graph.factors.odometry import Preintegration
 from ubl_graph.mission import Segment
@@ -19,6 +19,8 @@ NOMINAL_SPEED = 1500.0
 INTERPOLATION_SHARE = 0.1
 #: Without any measurement to ask for a node there is one at least every so many seconds.
 LONGEST_GAP = 10.0
+#: Stamps of one instant may differ by rounding: nodes nearer than this help nobody, s.
+SAME_INSTANT = 1e-6
 
 
 def order_of(options: Options) -> Order:
@@ -50,7 +52,8 @@ def node_times(
         )
     psd = max(options.horizontal_psd, options.vertical_psd)
     spacing = longest_interval(order_of(options), psd, INTERPOLATION_SHARE * min(sigmas))
-    return _filled(_thinned(wanted, np.isin(wanted, kept), spacing))
+    stay = np.any(np.abs(wanted[:, None] - kept) <= SAME_INSTANT, axis=1)
+    return _filled(_thinned(wanted, stay, spacing))
 
 
 def _candidates(
@@ -74,12 +77,11 @@ def _candidates(
         wanted.append(np.array([segment.start.t]))
         kept.append(wanted[-1])
     times = np.unique(np.concatenate(wanted))
-    # Stamps of one instant may differ by rounding; two nodes a microsecond apart help nobody.
-    times = times[np.concatenate([[True], np.diff(times) > 1e-6])]
+    times = times[np.concatenate([[True], np.diff(times) > SAME_INSTANT])]
     return times, np.concatenate(kept) if kept else np.empty(0), sigmas
 
 
-def _thinned(times: FloatArray, must_stay: np.ndarray, spacing: float) -> FloatArray:
+def _thinned(times: FloatArray, must_stay: BoolArray, spacing: float) -> FloatArray:
     """Leave out times whose neighbours are within `spacing` of each other."""
     if len(times) < 3 or np.diff(times).min() > spacing:
         return times

@@ -120,8 +120,10 @@ class SegmentResult:
         None where the segment has no ranges.
     status, reason : str
         What came of it, and why it is not "converged".
+    problem : int
+        Number of the problem it was solved in: segments that share unknowns are solved together.
     cost : float
-        Of the problem it was solved in (segments that share unknowns are solved together).
+        Of that problem.
     iterations : int
         Of that problem.
     chi_square, degrees_of_freedom : float, int
@@ -134,6 +136,7 @@ class SegmentResult:
     residuals: RangeResiduals | None
     status: Status
     reason: str
+    problem: int
     cost: float
     iterations: int
     chi_square: float

@@ -25,6 +25,8 @@ from ubl_graph.solve.marginals import Marginals
 
 #: A second track counts as no worse where its cost is higher by less than this: odds of 20 to 1.
 AMBIGUOUS_COST = 3.0
+#: A second track nearer than so many standard deviations is the same flat valley, not a rival.
+COVERED_SIGMAS = 3.0
 #: Outliers are a few per cent; where a fifth of the pings disagree, something else is wrong.
 SUSPICIOUS_SHARE = 0.2
 #: Sigmas would have to be three times too small to explain this.
@@ -73,7 +75,7 @@ def smooth(mission: Mission, progress: Progress | None = None) -> Result:
     shared: dict[str, Shared] = {}
     for number, group in enumerate(groups):
         work.begin(number / len(groups), 1.0 / len(groups))
-        results, unknowns = _smooth_group(work, group)
+        results, unknowns = _smooth_group(work, group, number)
         segments += results
         shared |= unknowns
     for segment in segments:
@@ -111,7 +113,7 @@ def _judge(work: _Work, segment: SegmentResult) -> None:
 
 
 def _smooth_group(
-    work: _Work, group: Sequence[SegmentModel]
+    work: _Work, group: Sequence[SegmentModel], number: int
 ) -> tuple[list[SegmentResult], dict[str, Shared]]:
     """Solve segments that share unknowns (most often a single one) in one problem."""
     with work.stage("start"):
@@ -119,11 +121,12 @@ def _smooth_group(
     group = [model for model, _ in searched]
     with work.stage("solve"):
         problem = build_problem(work.mission, group)
-        solution, rival = _solve_from(work, problem, [starts for _, starts in searched])
+        solution, rivals = _solve_from(work, problem, [starts for _, starts in searched])
     with work.stage("covariance"):
         marginals = Marginals(problem, solution)
+        rival = _rival(problem, solution, marginals, rivals)
         results = [
-            assemble_segment(problem, solution, marginals, chain, model, rival)
+            assemble_segment(problem, solution, marginals, chain, model, rival, number)
             for chain, model in zip(problem.layout.chains, group, strict=True)
         ]
         return results, shared_of(problem, solution, marginals)
@@ -145,32 +148,36 @@ def _search(work: _Work, model: SegmentModel) -> tuple[SegmentModel, Starts]:
 
 def _solve_from(
     work: _Work, problem: Problem, starts: Sequence[Starts]
-) -> tuple[Solution, str | None]:
+) -> tuple[Solution, list[Solution]]:
     """Solve from the best start, and from its rivals where a single segment has some.
 
-    Returns the cheapest solution, and what to say of a rival that is as good.
+    Returns the cheapest solution, and the others.
     """
-    tracks = [s.tracks[0] for s in starts]
-    best = work.solve(problem, _vector(problem, tracks))
-    rival: str | None = None
-    for track in starts[0].tracks[1:] if len(starts) == 1 else ():
-        other = work.solve(problem, _vector(problem, [track]))
+    choices = [[s.tracks[0] for s in starts]]
+    if len(starts) == 1:
+        choices += [[track] for track in starts[0].tracks[1:]]
+    solutions = [work.solve(problem, _vector(problem, tracks)) for tracks in choices]
+    best, *others = sorted(solutions, key=lambda s: s.cost)
+    return best, others
+
+
+def _rival(
+    problem: Problem, best: Solution, marginals: Marginals, others: Sequence[Solution]
+) -> str | None:
+    """What to say of another track that fits as well and that the covariance does not cover."""
+    sigma = np.sqrt(np.linalg.eigvalsh(marginals.of("position"))[:, -1])
+    covered = max(1.0, COVERED_SIGMAS * float(np.sqrt(np.mean(sigma**2))))
+    for other in others:
         gap = problem.layout.get(best.x, "position") - problem.layout.get(other.x, "position")
         apart = float(np.sqrt(np.mean(np.sum(gap**2, axis=1))))
-        if apart < 1.0:
-            continue
-        extra = abs(other.cost - best.cost)
-        if extra < AMBIGUOUS_COST:
-            rival = (
-                f"ambiguous: another track, {apart:.0f} m away (rms), fits as well "
-                f"(its cost differs by {extra:.2g}); a start, a fix, a turn or a second beacon "
-                "off the line would tell"
+        extra = other.cost - best.cost
+        if apart > covered and extra < AMBIGUOUS_COST:
+            return (
+                f"ambiguous: another track, {apart:.0f} m away (rms), fits as well (its cost is "
+                f"{extra:.2g} higher); a start, a fix, a turn or a second beacon off the line "
+                "would tell"
             )
-        elif other.cost < best.cost:
-            rival = None
-        if other.cost < best.cost:
-            best = other
-    return best, rival
+    return None
 
 
 def _vector(problem: Problem, tracks: Sequence[Track]) -> FloatArray:

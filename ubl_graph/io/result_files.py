@@ -100,7 +100,7 @@ def summary(result: Result) -> dict[str, Any]:
     """What result.json holds, as a plain dict; docs/outputs.md explains each key."""
     residuals = result.residuals
     errors = evaluate(result)
-    chi_square = sum({id(s): s.chi_square for s in _problems(result)}.values())
+    chi_square = sum(s.chi_square for s in _problems(result))
     dof = sum(s.degrees_of_freedom for s in _problems(result))
     content: dict[str, Any] = {
         "mission": result.mission.name,
@@ -141,8 +141,7 @@ def versions() -> dict[str, str]:
 
 def _problems(result: Result) -> list[SegmentResult]:
     """One segment of each problem: segments solved together share cost and counts."""
-    shared = result.mission.options.estimate_beacons or bool(result.shared)
-    return list(result.segments[:1] if shared else result.segments)
+    return list({s.problem: s for s in result.segments}.values())
 
 
 def _segment_summary(segment: SegmentResult, errors: Errors | None) -> dict[str, Any]:

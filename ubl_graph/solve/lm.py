@@ -21,7 +21,7 @@ INITIAL_LAMBDA, LAMBDA_FACTOR, LARGEST_LAMBDA = 1e-3, 10.0, 1e10
 RELATIVE_DECREASE = 1e-10
 #: or by less than this: a step of a hundred-thousandth of a standard deviation.
 ABSOLUTE_DECREASE = 1e-9
-#: Rounds in which the interpolation's variance is taken anew at the last estimate.
+#: Rounds, at most, in which the interpolation's variance is taken anew at the last estimate.
 FREEZE_ROUNDS = 5
 #: They end when no standard deviation changes by more than this share.
 FREEZE_TOLERANCE = 1e-4
@@ -44,15 +44,20 @@ class Solution:
         Sum of the losses at `x`.
     iterations : int
         Of all rounds.
-    converged : bool
-        Whether the cost came to rest within the iterations allowed.
+    trouble : str
+        Why it did not come to rest; empty where it did.
     """
 
     x: FloatArray
     frozen: Frozen
     cost: float
     iterations: int
-    converged: bool
+    trouble: str
+
+    @property
+    def converged(self) -> bool:
+        """Whether the cost came to rest."""
+        return not self.trouble
 
 
 def solve(
@@ -67,55 +72,66 @@ def solve(
     x : array
         Start, flat vector.
     max_iterations : int
-        For all rounds together.
+        Of each round; between rounds the interpolation's variance is taken anew, and most
+        problems, whose pings begin and end at nodes, need one round.
     progress : callable, optional
         Called after each iteration.
 
     Raises
     ------
     SolverError
-        Where the start or the solver's answer is not finite.
+        Where the start or the solver's answer is not finite, or GTSAM gives up.
     """
     if not np.isfinite(x).all():
         raise SolverError("the start of the solver holds values that are not finite")
     view = GraphView(problem)
-    used = 0
     frozen = problem.frozen(x)
-    while True:
-        x, cost, iterations, converged = _round(
-            view, x, frozen, max_iterations - used, used, progress
-        )
+    used, cost = 0, np.inf
+    for _ in range(FREEZE_ROUNDS):
+        try:
+            x, cost, iterations, trouble = _round(view, x, frozen, max_iterations, used, progress)
+        except RuntimeError as error:
+            text = " ".join(str(error).split())[:200]
+            raise SolverError(f"GTSAM gave up: {text}") from error
         used += iterations
         anew = problem.frozen(x)
-        settled = _change(frozen, anew) < FREEZE_TOLERANCE
-        if settled or not converged or used >= max_iterations * FREEZE_ROUNDS:
-            return Solution(x, frozen, cost, used, converged)
+        if trouble or _change(frozen, anew) < FREEZE_TOLERANCE:
+            return Solution(x, frozen, cost, used, trouble)
         frozen = anew
+    trouble = f"the interpolation's variance did not settle in {FREEZE_ROUNDS} rounds"
+    return Solution(x, frozen, cost, used, trouble)
 
 
 def _round(
     view: GraphView,
     x: FloatArray,
     frozen: Frozen,
-    budget: int,
+    most: int,
     before: int,
     progress: Progress | None,
-) -> tuple[FloatArray, float, int, bool]:
-    """One run of the optimiser: estimate, cost, iterations, converged."""
+) -> tuple[FloatArray, float, int, str]:
+    """One run of the optimiser: estimate, cost, iterations, and what went wrong."""
     graph = view.graph(frozen)
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, view.values(x), _parameters(view))
     cost = optimizer.error()
-    for done in range(1, max(budget, 1) + 1):
+    trouble = f"the cost did not come to rest in {most} iterations (max_iterations)"
+    done = 0
+    while done < most:
         optimizer.iterate()
+        done += 1
         previous, cost = cost, optimizer.error()
+        if not np.isfinite(cost):
+            raise SolverError("Levenberg-Marquardt met a cost that is not finite")
         if progress is not None:
             progress(before + done, cost)
         if previous - cost <= ABSOLUTE_DECREASE + RELATIVE_DECREASE * cost:
-            answer = view.vector(optimizer.values())
-            if not np.isfinite(answer).all() or not np.isfinite(cost):
-                raise SolverError("Levenberg-Marquardt ended in values that are not finite")
-            return answer, cost, done, bool(optimizer.lambda_() < LARGEST_LAMBDA)
-    return view.vector(optimizer.values()), cost, max(budget, 1), False
+            exhausted = optimizer.lambda_() >= LARGEST_LAMBDA
+            trouble = "no step lowers the cost, however damped" if exhausted else ""
+            break
+    answer = view.vector(optimizer.values())
+    if not np.isfinite(answer).all():
+        raise SolverError("Levenberg-Marquardt ended in values that are not finite")
+    return answer, cost, done, trouble
 
 
 def _parameters(view: GraphView) -> gtsam.LevenbergMarquardtParams:
