@@ -5,17 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from ubl_graph.acoustics import SoundSpeedProfile
+from ubl_graph.beacon import Beacon
 from ubl_graph.frames import LeverArm
 from ubl_graph.graph import build_problem, model_segment
-from ubl_graph.measurements import (
-    Attitude,
-    Beacon,
-    Depth,
-    OneWayRange,
-    PositionFix,
-    TwoWayRange,
-    Velocity,
-)
+from ubl_graph.measurements import Attitude, Depth, OneWayRange, PositionFix, TwoWayRange, Velocity
 from ubl_graph.mission import Mission, Segment, Start, Vehicle
 from ubl_graph.options import Options
 from ubl_graph.problem import Problem

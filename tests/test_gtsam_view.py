@@ -10,11 +10,12 @@ from hypothesis import strategies as st
 from problems import everything, problem_of, state_of
 
 from ubl_graph.acoustics import SoundSpeedProfile
+from ubl_graph.beacon import Beacon
 from ubl_graph.factors import linear
 from ubl_graph.factors.loss import RobustLoss
 from ubl_graph.gtsam_view import GraphView, jacobian_factor
 from ubl_graph.layout import Chain, Layout
-from ubl_graph.measurements import Beacon, Depth, TwoWayRange
+from ubl_graph.measurements import Depth, TwoWayRange
 from ubl_graph.mission import Mission, Segment
 from ubl_graph.options import Options
 from ubl_graph.problem import Problem

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ubl_graph.beacon import Beacon
 from ubl_graph.errors import ConfigurationError, DataError
 from ubl_graph.frames import GeodeticOrigin
 from ubl_graph.io import records
 from ubl_graph.io.tables import naming, nearest, read_table
-from ubl_graph.measurements import Beacon
 
 BEACONS = (Beacon("B1", [0.0, 0.0, -10.0], turnaround=0.5), Beacon("B2", [9.0, 0.0, -10.0]))
 

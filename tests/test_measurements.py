@@ -7,18 +7,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ubl_graph.beacon import Beacon
 from ubl_graph.errors import DataError
 from ubl_graph.measurements import (
     MAX_TRAVEL_TIME,
     Attitude,
-    Beacon,
     Depth,
     OneWayRange,
     PositionFix,
-    Source,
     TwoWayRange,
     Velocity,
 )
+from ubl_graph.records import Source
 
 SOURCE = Source("pings.csv", np.array([1, 2, 3]), np.array([2, 4, 5]))
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ubl_graph.acoustics import SoundSpeedProfile
+    from ubl_graph.beacon import Beacon
     from ubl_graph.errors import (
         ConfigurationError,
         DataError,
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from ubl_graph.io.mission_file import load_mission
     from ubl_graph.measurements import (
         Attitude,
-        Beacon,
         Depth,
         OneWayRange,
         PositionFix,
@@ -59,7 +59,7 @@ _HOME = {
     "LeverArm": "frames",
     "load_mission": "io.mission_file",
     "Attitude": "measurements",
-    "Beacon": "measurements",
+    "Beacon": "beacon",
     "Depth": "measurements",
     "OneWayRange": "measurements",
     "PositionFix": "measurements",

@@ -16,11 +16,11 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 from ubl_graph.arrays import FloatArray
-from ubl_graph.factors.odometry import Preintegration
 from ubl_graph.graph import FREE_ACCELERATION, FREE_POSITION, SegmentModel
-from ubl_graph.layout import Chain, Layout
 from ubl_graph.mission import Mission, Segment, Start
 from ubl_graph.nodes import order_of
+from ubl_graph.reckoning import DeadReckoning
+from ubl_graph.track import Track
 from ubl_graph.trajectory import interpolation_variance, process_noise
 from ubl_graph.windows import (
     ACCELERATION,
@@ -31,7 +31,6 @@ from ubl_graph.windows import (
     VELOCITY,
     Hypotheses,
     Prior,
-    Sightings,
     fit,
 )
 
@@ -55,28 +54,6 @@ WORTH_TRYING = 30.0
 MOST_TRACKS = 3
 #: A start prior so many sigmas from every answer of the data is not believed.
 START_LIMIT = 6.0
-
-
-@dataclass(frozen=True, eq=False)
-class Track:
-    """A start for one segment.
-
-    Attributes
-    ----------
-    position, velocity, acceleration : array, shape (N, 3)
-        At the nodes; m, m/s, m/s^2.
-    scale, clock : array, shape (N,)
-        Log scale of the travel times, clock offset (s).
-    cost : float
-        Of the way through the windows.
-    """
-
-    position: FloatArray
-    velocity: FloatArray
-    acceleration: FloatArray
-    scale: FloatArray
-    clock: FloatArray
-    cost: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +86,7 @@ def find_starts(mission: Mission, model: SegmentModel) -> Starts:
     -------
     Starts
     """
-    reckoning = _DeadReckoning(mission, model)
+    reckoning = DeadReckoning(mission, model)
     segment = model.segment
     windows = [_fit_window(mission, segment, reckoning, *w) for w in _windows(mission, reckoning)]
     own = [window.cost for window in windows]
@@ -123,112 +100,7 @@ def find_starts(mission: Mission, model: SegmentModel) -> Starts:
     return Starts(tuple(_apart(tracks)), sigmas)
 
 
-def place(layout: Layout, chain: Chain, track: Track, x: FloatArray) -> None:
-    """Write a track into the flat vector `x`, in place."""
-    nodes = chain.first + np.arange(len(chain.t))
-    values = {
-        "position": track.position,
-        "velocity": track.velocity,
-        "acceleration": track.acceleration,
-        "sound_speed": track.scale[:, None],
-        "clock_offset": track.clock[:, None],
-    }
-    for name, value in values.items():
-        if layout.has(name):
-            x[layout.node_columns(name, nodes)] = value / layout.unit(name)
-
-
-class _DeadReckoning:
-    """What is known of a segment's track but for its place: displacements, depth, sightings."""
-
-    def __init__(self, mission: Mission, model: SegmentModel) -> None:
-        self.mission, self.model = mission, model
-        self.odometry: Preintegration | None = model.bottom or model.water
-        depth = model.segment.depth
-        self.depth = None if depth is None or not len(depth) else depth[np.argsort(depth.t)]
-        self.sightings = self._sightings()
-
-    def offset(self, t: FloatArray) -> FloatArray:
-        """Displacement since the first node (and the up where depth is known), (M, 3), m."""
-        if not len(t):
-            return np.empty((0, 3))
-        if self.odometry is None:
-            moved = np.zeros((len(t), 3))
-        else:
-            moved = self.odometry.between(np.full(len(t), self.model.t[0]), t).displacement
-        if self.depth is not None:
-            arm = self.mission.vehicle.depth_sensor
-            lever = self.model.attitude.lever(arm, t)[:, 2]
-            moved[:, 2] = -np.interp(t, self.depth.t, self.depth.depth) - lever
-        return moved
-
-    def _sightings(self) -> Sightings:
-        segment, names = self.model.segment, list(self.mission.beacon_names)
-        parts: list[list[FloatArray]] = []
-        for pings, one_way in ((segment.two_way_range, False), (segment.one_way_range, True)):
-            if pings is None or not len(pings):
-                continue
-            first = pings.t_receive if one_way else pings.t_transmit
-            share = np.array([1.0, 0.0 if one_way else 1.0])
-            beacon = np.array(
-                [self.mission.beacons[names.index(str(b))].position for b in pings.beacon]
-            )
-            m = len(pings)
-            parts.append(
-                [
-                    np.stack([first, pings.t_receive], axis=1),
-                    np.tile(share, (m, 1)),
-                    beacon,
-                    pings.travel_time,
-                    pings.sigma,
-                    np.full(m, float(one_way)),
-                ]
-            )
-        empty = [np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 3)), *[np.empty(0)] * 3]
-        t, share, beacon, measured, sigma, clock = (
-            (np.concatenate(column) for column in zip(*parts, strict=True)) if parts else empty
-        )
-        order = np.argsort(t[:, 0], kind="stable")
-        t, share, beacon, measured, sigma, clock = (
-            a[order] for a in (t, share, beacon, measured, sigma, clock)
-        )
-        arm = self.mission.vehicle.transducer
-        offset = (self.offset(t.ravel()) + self.model.attitude.lever(arm, t.ravel())).reshape(
-            -1, 2, 3
-        )
-        return Sightings(t, share, offset, beacon, measured, sigma, clock, *self._fixes())
-
-    def _fixes(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Fixes, the start prior among them: times, positions, displacements, sigmas.
-
-        Their loss in a window is Cauchy's, so a start that contradicts the pings does not
-        outweigh them all; where the pings leave a valley it picks the place in it.
-        """
-        t, position, sigma = [np.empty(0)], [np.empty((0, 3))], [np.empty((0, 3))]
-        lever = [np.empty((0, 3))]
-        start, fixes = self.model.segment.start, self.model.segment.position
-        if start is not None:
-            up = np.inf if start.up is None else start.sigma
-            t.append(np.array([start.t]))
-            position.append(np.array([[start.east, start.north, start.up or 0.0]]))
-            sigma.append(np.array([[start.sigma, start.sigma, up]]))
-            lever.append(np.zeros((1, 3)))
-        if fixes is not None and len(fixes):
-            d = fixes.dimension
-            place, spread = np.zeros((len(fixes), 3)), np.full((len(fixes), 3), np.inf)
-            place[:, :d] = fixes.position
-            spread[:, :d] = np.sqrt(np.einsum("mii->mi", fixes.covariances))
-            t.append(fixes.t)
-            position.append(place)
-            sigma.append(spread)
-            lever.append(self.model.attitude.lever(self.mission.vehicle.antenna, fixes.t))
-        columns = [np.concatenate(c) for c in (t, position, sigma, lever)]
-        order = np.argsort(columns[0], kind="stable")
-        times, places, spreads, levers = (c[order] for c in columns)
-        return times, places, self.offset(times) + levers, spreads
-
-
-def _windows(mission: Mission, reckoning: _DeadReckoning) -> list[tuple[float, float]]:
+def _windows(mission: Mission, reckoning: DeadReckoning) -> list[tuple[float, float]]:
     """Spans of the windows: as long as asked, longer where ranges are few."""
     s = reckoning.sightings
     times = np.sort(np.concatenate([s.t[:, 0], s.fix_t]))
@@ -248,7 +120,7 @@ def _windows(mission: Mission, reckoning: _DeadReckoning) -> list[tuple[float, f
 
 
 def _fit_window(
-    mission: Mission, segment: Segment, reckoning: _DeadReckoning, begin: float, end: float
+    mission: Mission, segment: Segment, reckoning: DeadReckoning, begin: float, end: float
 ) -> Hypotheses:
     s = reckoning.sightings
     rows = (s.t[:, 0] >= begin) & (s.t[:, 0] <= end)
@@ -276,7 +148,7 @@ def _fit_window(
     )
 
 
-def _window_prior(mission: Mission, segment: Segment, reckoning: _DeadReckoning) -> Prior:
+def _window_prior(mission: Mission, segment: Segment, reckoning: DeadReckoning) -> Prior:
     options = mission.options
     mean, sigma = np.zeros(PARAMETERS), np.empty(PARAMETERS)
     if mission.beacons:
@@ -305,7 +177,7 @@ def _window_prior(mission: Mission, segment: Segment, reckoning: _DeadReckoning)
     return Prior(mean, sigma)
 
 
-def _model_sigma(mission: Mission, reckoning: _DeadReckoning, begin: float, end: float) -> float:
+def _model_sigma(mission: Mission, reckoning: DeadReckoning, begin: float, end: float) -> float:
     """What the true motion may deviate from the window's model by, m."""
     span = end - begin
     if reckoning.odometry is None:
@@ -355,7 +227,7 @@ def _viterbi(own: list[FloatArray], steps: list[FloatArray]) -> list[tuple[list[
 
 
 def _step_cost(
-    mission: Mission, a: Hypotheses, b: Hypotheses, reckoning: _DeadReckoning
+    mission: Mission, a: Hypotheses, b: Hypotheses, reckoning: DeadReckoning
 ) -> FloatArray:
     """Price of going from each answer of one window to each of the next, (H_a, H_b).
 
@@ -395,7 +267,7 @@ def _start_window(windows: list[Hypotheses], segment: Segment) -> int | None:
     return int(np.argmin([abs(w.t - segment.start.t) for w in windows]))
 
 
-def _start_sigmas(window: Hypotheses, reckoning: _DeadReckoning, start: Start) -> FloatArray:
+def _start_sigmas(window: Hypotheses, reckoning: DeadReckoning, start: Start) -> FloatArray:
     """Mahalanobis distance of each of a window's answers from the start prior, (H,)."""
     dt = start.t - window.t
     parameters, covariance = _carried(window, dt)
@@ -412,7 +284,7 @@ def _start_sigmas(window: Hypotheses, reckoning: _DeadReckoning, start: Start) -
 
 def _track(
     model: SegmentModel,
-    reckoning: _DeadReckoning,
+    reckoning: DeadReckoning,
     windows: list[Hypotheses],
     way: list[int],
     cost: float,

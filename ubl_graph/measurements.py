@@ -9,20 +9,18 @@ record, or the file, row and field it came from.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, Literal, Self
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from ubl_graph.arrays import ArrayLike, BoolArray, FloatArray, IntArray, frozen
-from ubl_graph.errors import DataError
+from ubl_graph.arrays import ArrayLike, FloatArray
+from ubl_graph.records import Records, Source, record_error
 
 #: A two-way ping that took longer than this did not happen (45 km at 1500 m/s), s.
 MAX_TRAVEL_TIME = 60.0
 #: A travel time may exceed receive minus transmit time by so much (clock granularity), s.
 STAMP_TOLERANCE = 0.1
-#: Times beyond this are not seconds since an epoch (they may be nanoseconds), s.
-MAX_TIME = 1e11
 
 # One standard deviation of each kind where neither a column nor an option gives it.
 TRAVEL_TIME_SIGMA = 1e-4  #: s; modems and seafloor transponders reach 0.05 to 0.2 ms
@@ -30,150 +28,6 @@ VELOCITY_SIGMA = 0.01  #: m/s; a 600 kHz DVL's single-ping noise
 ATTITUDE_SIGMA = float(np.deg2rad(0.2))  #: rad; a fibre-optic gyrocompass
 DEPTH_SIGMA = 0.1  #: m; a pressure sensor of 0.01 % of 1 000 m
 POSITION_SIGMA = 2.0  #: m; GNSS without corrections
-
-
-@dataclass(frozen=True)
-class Source:
-    """Where records came from, so that an error found later can still name the place.
-
-    Attributes
-    ----------
-    file : str
-        File name as the user gave it.
-    row : array, shape (M,)
-        Data row of each record, counted from 1.
-    line : array, shape (M,)
-        Line of the file of each record, counted from 1.
-    """
-
-    file: str
-    row: IntArray
-    line: IntArray
-
-    def __getitem__(self, index: Any) -> Source:
-        return Source(self.file, self.row[index], self.line[index])
-
-    def error(self, index: int, field: str, problem: str, remedy: str = "") -> DataError:
-        """Build the error that names the file, row and line of record `index`."""
-        return DataError(
-            problem,
-            remedy,
-            file=self.file,
-            row=int(self.row[index]),
-            line=int(self.line[index]),
-            field=field,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class Records:
-    """Base of the record classes: broadcasting, checks, selection."""
-
-    #: Legal range of each numeric column; others need only be finite.
-    LIMITS: ClassVar[dict[str, tuple[float, float, str]]] = {}
-    #: Columns that hold words.
-    TEXT: ClassVar[frozenset[str]] = frozenset({"beacon", "reference"})
-
-    def __post_init__(self) -> None:
-        columns = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "source"}
-        arrays = {n: np.atleast_1d(np.asarray(v)) for n, v in columns.items() if v is not None}
-        lengths = {len(a) for a in arrays.values()} - {1}
-        if len(lengths) > 1:
-            sizes = ", ".join(f"{n}: {len(a)}" for n, a in arrays.items())
-            raise DataError(
-                f"{type(self).__name__} columns of different length ({sizes})",
-                "give one value per record, or one for all",
-            )
-        size = lengths.pop() if lengths else 1
-        for name, array in arrays.items():
-            full = np.broadcast_to(array, (size, *array.shape[1:]))
-            object.__setattr__(self, name, self._column(name, full))
-        self._check()
-
-    def _column(self, name: str, values: Any) -> Any:
-        if name in self.TEXT:
-            return frozen(values, np.str_)
-        try:
-            if values.dtype.kind in "US":
-                raise TypeError("numbers written as text")
-            column = frozen(values)
-        except (TypeError, ValueError) as error:
-            raise DataError(
-                f"{type(self).__name__} takes numbers here", "give floats", field=name
-            ) from error
-        if column.ndim != (3 if name == "covariance" else 1):
-            raise DataError(
-                f"{type(self).__name__} takes one value per record here, not shape {column.shape}",
-                field=name,
-            )
-        broken: Any = ~np.isfinite(column)
-        self._forbid(
-            broken if column.ndim == 1 else broken.any(axis=(1, 2)),
-            name,
-            column,
-            " is not a finite number",
-            "drop or mend it",
-        )
-        if name == "t" or name.startswith("t_"):
-            self._forbid(np.abs(column) > MAX_TIME, name, column, " s is no time in seconds")
-        if name in self.LIMITS:
-            low, high, unit = self.LIMITS[name]
-            self._forbid(
-                (column < low) | (column > high),
-                name,
-                column,
-                f" {unit} is outside {low:g} to {high:g} {unit}",
-                "check the unit",
-            )
-        return column
-
-    def _forbid(
-        self, bad: BoolArray, name: str, values: Any, problem: str, remedy: str = "check the unit"
-    ) -> None:
-        if bad.any():
-            i = int(np.argmax(bad))
-            value = values[i] if np.ndim(values[i]) == 0 else values[i].tolist()
-            raise self.error(i, name, f"{value}{problem}", remedy)
-
-    def _check(self) -> None:
-        """Check across columns; overridden where a kind has such rules."""
-
-    @property
-    def _source(self) -> Source | None:
-        return getattr(self, "source", None)
-
-    def error(self, index: int, field: str, problem: str, remedy: str = "") -> DataError:
-        """Build the error that names record `index`, by file and row where these are known."""
-        return _record_error(type(self), self._source, index, field, problem, remedy)
-
-    def __len__(self) -> int:
-        return len(getattr(self, fields(self)[0].name))
-
-    def __getitem__(self, index: Any) -> Self:
-        """Select by integer, slice, mask or index array; the result is again a record object."""
-        if isinstance(index, (int, np.integer)):
-            index = np.atleast_1d(np.arange(len(self))[index])
-        chosen: dict[str, Any] = {}
-        for f in fields(self):
-            value = getattr(self, f.name)
-            chosen[f.name] = None if value is None else value[index]
-        return replace(self, **chosen)
-
-    def duplicates(self, *columns: str) -> int | None:
-        """Index of the first record that repeats an earlier one in `columns`, or None."""
-        keys = np.rec.fromarrays([getattr(self, c) for c in columns])
-        _, first = np.unique(keys, return_index=True)
-        if len(first) == len(self):
-            return None
-        return int(np.setdiff1d(np.arange(len(self)), first)[0])
-
-
-def _record_error(
-    kind: type[Records], source: Source | None, index: int, field: str, problem: str, remedy: str
-) -> DataError:
-    if source is not None:
-        return source.error(index, field, problem, remedy)
-    return DataError(problem, remedy, record=f"{kind.__name__}[{index}]", field=field)
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +102,7 @@ class TwoWayRange(Records):
         if early.any():
             i = int(np.argmax(early))
             wait, arrival = (np.broadcast_to(a, travel.shape)[i] for a in (waited, heard))
-            raise _record_error(
+            raise record_error(
                 cls,
                 source,
                 i,
@@ -291,7 +145,7 @@ class TwoWayRange(Records):
         for name, (values, sound, problem, remedy) in rules.items():
             if not sound.all():
                 i = int(np.argmin(sound))
-                raise _record_error(cls, source, i, name, f"{values[i]} {problem}", remedy)
+                raise record_error(cls, source, i, name, f"{values[i]} {problem}", remedy)
         return cls(beacon, t_transmit, t_receive, 2.0 * slant / speed, sigma, source)
 
 
@@ -528,63 +382,3 @@ class PositionFix(Records):
         if self.covariance is not None:
             return self.covariance
         return np.eye(self.dimension) * self.sigma[:, None, None] ** 2
-
-
-@dataclass(frozen=True, eq=False)
-class Beacon:
-    """An acoustic beacon at a fixed position.
-
-    Parameters
-    ----------
-    name : str
-        The name that range records use.
-    position : array, shape (3,)
-        East, north, up, m.
-    sigma : float or array, shape (3,), default 0
-        Standard deviation of the position, m; used only where beacons are estimated, where
-        0 means that nothing is known beforehand.
-    turnaround : float, optional
-        Time from hearing a ping to answering it, s; needed where pings come without a travel
-        time.
-    """
-
-    name: str
-    position: Any
-    sigma: Any = 0.0
-    turnaround: float | None = None
-
-    def __post_init__(self) -> None:
-        position = _numbers(self.position)
-        if position is None or position.shape != (3,):
-            raise self._error(
-                "position",
-                f"{self.position} is no east, north, up in metres",
-                "give three finite numbers",
-            )
-        sigma = _numbers(self.sigma)
-        if sigma is None or sigma.shape not in ((), (1,), (3,)) or (sigma < 0).any():
-            raise self._error(
-                "sigma",
-                f"{self.sigma} is no standard deviation in metres",
-                "give one or three numbers, zero or more",
-            )
-        wait = _numbers(0.0 if self.turnaround is None else self.turnaround)
-        if wait is None or wait.shape != () or not 0.0 <= wait <= MAX_TRAVEL_TIME:
-            raise self._error(
-                "turnaround", f"a turnaround of {self.turnaround} s", "give seconds, zero or more"
-            )
-        object.__setattr__(self, "position", frozen(position))
-        object.__setattr__(self, "sigma", frozen(np.broadcast_to(sigma, (3,))))
-
-    def _error(self, field: str, problem: str, remedy: str) -> DataError:
-        one_line = " ".join(problem.split())
-        return DataError(one_line, remedy, record=f"beacon '{self.name}'", field=field)
-
-
-def _numbers(values: ArrayLike) -> FloatArray | None:
-    """Finite numbers as an array, or None where `values` are anything else."""
-    try:
-        array = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        return None
-    return array if np.isfinite(array).all() else None

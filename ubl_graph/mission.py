@@ -10,19 +10,12 @@ import numpy as np
 
 from ubl_graph.acoustics import SoundSpeedProfile
 from ubl_graph.arrays import FloatArray, frozen
+from ubl_graph.beacon import Beacon
 from ubl_graph.errors import ConfigurationError, DataError
 from ubl_graph.frames import GeodeticOrigin, LeverArm
-from ubl_graph.measurements import (
-    Attitude,
-    Beacon,
-    Depth,
-    OneWayRange,
-    PositionFix,
-    Records,
-    TwoWayRange,
-    Velocity,
-)
+from ubl_graph.measurements import Attitude, Depth, OneWayRange, PositionFix, TwoWayRange, Velocity
 from ubl_graph.options import Options
+from ubl_graph.records import Records
 
 #: Relative standard deviation of the sound speed at the start: a measured profile, a constant.
 PROFILE_SIGMA, CONSTANT_SIGMA = 1e-3, 5e-3

@@ -16,12 +16,13 @@ import numpy as np
 from ubl_graph.arrays import FloatArray
 from ubl_graph.assembly import assemble_segment, beacons_of, shared_of
 from ubl_graph.graph import SegmentModel, build_problem, model_segment
-from ubl_graph.initial import START_LIMIT, Starts, Track, find_starts, place
+from ubl_graph.initial import START_LIMIT, Starts, find_starts
 from ubl_graph.mission import Mission
 from ubl_graph.problem import Problem
 from ubl_graph.result import Result, SegmentResult, Shared
 from ubl_graph.solve.lm import Solution, solve
 from ubl_graph.solve.marginals import Marginals
+from ubl_graph.track import Track, mirror_images, place, track_of
 
 #: A second track counts as no worse where its cost is higher by less than this: odds of 20 to 1.
 AMBIGUOUS_COST = 3.0
@@ -121,7 +122,7 @@ def _smooth_group(
     group = [model for model, _ in searched]
     with work.stage("solve"):
         problem = build_problem(work.mission, group)
-        solution, rivals = _solve_from(work, problem, [starts for _, starts in searched])
+        solution, rivals = _solve_from(work, problem, group, [s for _, s in searched])
     with work.stage("covariance"):
         marginals = Marginals(problem, solution)
         rival = _rival(problem, solution, marginals, rivals)
@@ -147,16 +148,17 @@ def _search(work: _Work, model: SegmentModel) -> tuple[SegmentModel, Starts]:
 
 
 def _solve_from(
-    work: _Work, problem: Problem, starts: Sequence[Starts]
+    work: _Work, problem: Problem, group: Sequence[SegmentModel], starts: Sequence[Starts]
 ) -> tuple[Solution, list[Solution]]:
-    """Solve from the best start, and from its rivals where a single segment has some.
+    """Solve from the best start, and from its rivals and mirror images in a single segment.
 
     Returns the cheapest solution, and the others.
     """
-    choices = [[s.tracks[0] for s in starts]]
-    if len(starts) == 1:
-        choices += [[track] for track in starts[0].tracks[1:]]
-    solutions = [work.solve(problem, _vector(problem, tracks)) for tracks in choices]
+    solutions = [work.solve(problem, _vector(problem, [s.tracks[0] for s in starts]))]
+    if len(group) == 1:
+        found = track_of(problem.layout, problem.layout.chains[0], solutions[0].x)
+        rivals = [*starts[0].tracks[1:], *mirror_images(work.mission, group[0], found)]
+        solutions += [work.solve(problem, _vector(problem, [track])) for track in rivals]
     best, *others = sorted(solutions, key=lambda s: s.cost)
     return best, others
 

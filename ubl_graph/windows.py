@@ -28,8 +28,10 @@ PARAMETERS = 11
 #: Directions around a beacon in which starts are laid on its range circle.
 AZIMUTHS = 16
 ITERATIONS = 40
-#: Hypotheses kept for a window.
+#: Hypotheses kept for a window in any case,
 KEPT = 6
+#: and more of them where so little tells them apart (one beacon and no heading: a whole circle).
+VALLEY_COST, MOST_KEPT = 10.0, 48
 #: Cauchy width, in sigmas, of the windows' residuals.
 WIDTH = 2.3849
 
@@ -296,6 +298,7 @@ def _distinct(
         gaps = np.linalg.norm(theta[kept, :3] - theta[i, :3], axis=1) if kept else np.empty(0)
         if not (gaps < max(5.0, 3.0 * tolerance)).any():
             kept.append(int(i))
-        if len(kept) == KEPT:
+        close = cost[i] < cost[kept[0]] + VALLEY_COST
+        if len(kept) >= (MOST_KEPT if close else KEPT):
             break
     return Hypotheses(t_mid, theta[kept], frozen(np.linalg.inv(hessian[kept])), cost[kept])

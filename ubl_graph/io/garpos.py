@@ -17,11 +17,12 @@ from typing import Any
 import numpy as np
 
 from ubl_graph.arrays import BoolArray, FloatArray
+from ubl_graph.beacon import Beacon
 from ubl_graph.errors import ConfigurationError, DataError
 from ubl_graph.frames import GeodeticOrigin, LeverArm, world_R_body
 from ubl_graph.io.records import degrees
 from ubl_graph.io.tables import Table, did_you_mean, naming, read_table, read_text, shortened
-from ubl_graph.measurements import TRAVEL_TIME_SIGMA, Beacon, Depth, TwoWayRange
+from ubl_graph.measurements import TRAVEL_TIME_SIGMA, Depth, TwoWayRange
 from ubl_graph.mission import Reference, Segment
 
 #: Standard deviation of the transducer's depth, m: kinematic GNSS heave.

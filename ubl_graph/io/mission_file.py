@@ -14,6 +14,7 @@ from typing import Any
 
 from ubl_graph.acoustics import SoundSpeedProfile
 from ubl_graph.arrays import FloatArray
+from ubl_graph.beacon import Beacon
 from ubl_graph.errors import ConfigurationError
 from ubl_graph.frames import GeodeticOrigin, LeverArm
 from ubl_graph.io import records
@@ -31,9 +32,9 @@ from ubl_graph.io.mission_schema import (
     validated,
 )
 from ubl_graph.io.tables import naming, read_text
-from ubl_graph.measurements import Beacon, Records
 from ubl_graph.mission import RECORD_KINDS, Mission, Segment, Start, Vehicle
 from ubl_graph.options import Options
+from ubl_graph.records import Records
 
 
 def load_mission(path: str | Path) -> Mission:

@@ -18,20 +18,20 @@ import numpy as np
 from ubl_graph.acoustics import SoundSpeedProfile
 from ubl_graph.acoustics.profile import FASTEST, SLOWEST
 from ubl_graph.arrays import FloatArray
+from ubl_graph.beacon import Beacon
 from ubl_graph.errors import ConfigurationError, DataError
 from ubl_graph.frames import GeodeticOrigin
 from ubl_graph.io.tables import Table, did_you_mean, naming, nearest, read_table
 from ubl_graph.measurements import (
     TRAVEL_TIME_SIGMA,
     Attitude,
-    Beacon,
     Depth,
     OneWayRange,
     PositionFix,
-    Records,
     TwoWayRange,
     Velocity,
 )
+from ubl_graph.records import Records
 
 HORIZONTAL_COVARIANCE = ("cov_east_east", "cov_east_north", "cov_north_north")
 VERTICAL_COVARIANCE = ("cov_east_up", "cov_north_up", "cov_up_up")

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from ubl_graph.acoustics import SoundSpeedProfile
-from ubl_graph.measurements import Beacon, Records
+from ubl_graph.beacon import Beacon
 from ubl_graph.mission import Mission, Segment, Start
+from ubl_graph.records import Records
 
 #: A profile of more samples is thinned to these, for a file that people read.
 MAX_SAMPLES = 200

@@ -20,7 +20,7 @@ import numpy as np
 
 from ubl_graph.arrays import BoolArray, FloatArray, IntArray
 from ubl_graph.errors import DataError
-from ubl_graph.measurements import Source
+from ubl_graph.records import Source
 
 #: How alike two names must be (difflib ratio) for one to be taken as a slip for the other.
 LIKENESS = 0.75

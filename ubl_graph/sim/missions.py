@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from ubl_graph.acoustics import SoundSpeedProfile
+from ubl_graph.beacon import Beacon
 from ubl_graph.frames import LeverArm
-from ubl_graph.measurements import ATTITUDE_SIGMA, Beacon
+from ubl_graph.measurements import ATTITUDE_SIGMA
 from ubl_graph.mission import Mission, Segment, Start, Vehicle
 from ubl_graph.options import Options
 from ubl_graph.sim import sensors

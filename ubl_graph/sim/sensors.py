@@ -14,6 +14,7 @@ import numpy as np
 
 from ubl_graph.acoustics import SoundSpeedProfile, eigenray, straight
 from ubl_graph.arrays import ArrayLike, FloatArray
+from ubl_graph.beacon import Beacon
 from ubl_graph.errors import SolverError
 from ubl_graph.frames import LeverArm, body_vector
 from ubl_graph.measurements import (
@@ -23,7 +24,6 @@ from ubl_graph.measurements import (
     TRAVEL_TIME_SIGMA,
     VELOCITY_SIGMA,
     Attitude,
-    Beacon,
     Depth,
     OneWayRange,
     PositionFix,

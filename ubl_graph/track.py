@@ -1,0 +1,112 @@
+"""A track at a segment's nodes as a solver's start: to and from the flat vector, and mirrored."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ubl_graph.arrays import FloatArray
+from ubl_graph.graph import SegmentModel
+from ubl_graph.layout import Chain, Layout
+from ubl_graph.mission import Mission
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A start for one segment.
+
+    Attributes
+    ----------
+    position, velocity, acceleration : array, shape (N, 3)
+        At the nodes; m, m/s, m/s^2.
+    scale, clock : array, shape (N,)
+        Log scale of the travel times, clock offset (s).
+    cost : float
+        Of the way through the windows.
+    """
+
+    position: FloatArray
+    velocity: FloatArray
+    acceleration: FloatArray
+    scale: FloatArray
+    clock: FloatArray
+    cost: float
+
+
+def place(layout: Layout, chain: Chain, track: Track, x: FloatArray) -> None:
+    """Write a track into the flat vector `x`, in place."""
+    nodes = chain.first + np.arange(len(chain.t))
+    values = {
+        "position": track.position,
+        "velocity": track.velocity,
+        "acceleration": track.acceleration,
+        "sound_speed": track.scale[:, None],
+        "clock_offset": track.clock[:, None],
+    }
+    for name, value in values.items():
+        if layout.has(name):
+            x[layout.node_columns(name, nodes)] = value / layout.unit(name)
+
+
+def track_of(layout: Layout, chain: Chain, x: FloatArray) -> Track:
+    """Read a track back from the flat vector `x`: the inverse of `place`."""
+
+    def read(name: str, width: int) -> FloatArray:
+        if layout.has(name):
+            return layout.get(x, name)[chain.nodes]
+        return np.zeros((len(chain.t), width))
+
+    return Track(
+        read("position", 3),
+        read("velocity", 3),
+        read("acceleration", 3),
+        read("sound_speed", 1)[:, 0],
+        read("clock_offset", 1)[:, 0],
+        0.0,
+    )
+
+
+def mirror_images(mission: Mission, model: SegmentModel, track: Track) -> list[Track]:
+    """Tracks that the ranges to a single beacon cannot tell from this one.
+
+    Without odometry they fit as well when reflected in a vertical plane through the beacon: along
+    the mean course, or through the start where a prior holds that. Windows find such images too,
+    but on a valley of answers only by luck.
+
+    Parameters
+    ----------
+    mission, model
+        Whose ranges.
+    track : Track
+        To reflect.
+
+    Returns
+    -------
+    list of Track
+        Empty with odometry, with a second beacon, or without any.
+    """
+    segment = model.segment
+    ranges = [r for r in (segment.two_way_range, segment.one_way_range) if r is not None]
+    heard = {str(name) for r in ranges for name in r.beacon}
+    if len(heard) != 1 or model.bottom is not None or model.water is not None:
+        return []
+    beacon = next(b for b in mission.beacons if b.name in heard).position[:2]
+    axes = [track.position[-1, :2] - track.position[0, :2]]
+    if segment.start is not None:
+        axes.append(np.array([segment.start.east, segment.start.north]) - beacon)
+    return [_reflected(track, beacon, axis) for axis in axes if np.linalg.norm(axis) > 1.0]
+
+
+def _reflected(track: Track, point: FloatArray, axis: FloatArray) -> Track:
+    """Reflect a track in the vertical plane through a point along an axis (east, north)."""
+    unit = axis / np.linalg.norm(axis)
+    mirror = np.eye(3)
+    mirror[:2, :2] = 2.0 * np.outer(unit, unit) - np.eye(2)
+    centre = np.array([*point, 0.0])
+    return replace(
+        track,
+        position=(track.position - centre) @ mirror + centre,
+        velocity=track.velocity @ mirror,
+        acceleration=track.acceleration @ mirror,
+    )
