@@ -64,13 +64,17 @@ def smooth(
 
     Example: ubl-graph smooth dive.toml -o dive-out
     """
+    from ubl_graph.evaluation import Errors, evaluate
     from ubl_graph.io.mission_file import load_mission
 
     loaded = load_mission(mission)
     _check_output(output)
     result = _smooth(loaded)
     _write(result, output, figures)
-    _print_result(result)
+    _print_segments(result)
+    compared = evaluate(result)
+    if compared:
+        _print_errors({"against the reference": Errors.joined(compared.values())})
 
 
 @app.command()
@@ -90,9 +94,9 @@ def demo(
     _check_output(output)
     mission, _ = demo_survey(seed)
     result = _smooth(mission)
-    _write(result, output, figures)
-    _print_result(result)
     reckoned = dead_reckoning(mission)
+    _write(result, output, figures, {"dead reckoning": list(reckoned.values())})
+    _print_segments(result)
     rows: dict[str, Errors] = {}
     for segment in mission.segments:
         assert segment.reference is not None
@@ -122,10 +126,10 @@ def _smooth(mission: Mission) -> Result:
         return run(mission, report)
 
 
-def _write(result: Result, folder: Path, figures: bool) -> None:
+def _write(result: Result, folder: Path, figures: bool, beside: Any = None) -> None:
     from ubl_graph.io.result_files import write_result
 
-    write_result(result, folder, figures)
+    write_result(result, folder, figures, beside)
     typer.echo(f"written to {folder}")
 
 
@@ -161,13 +165,10 @@ def _progress(name: str) -> Generator[Report]:
             bar.stop()
 
 
-def _print_result(result: Result) -> None:
-    from ubl_graph.evaluation import Errors, evaluate
-
+def _print_segments(result: Result) -> None:
     typer.echo(f"status: {result.status}" + (f" ({result.reason})" if result.reason else ""))
     for warning in result.warnings:
         typer.echo(f"warning: {warning}", err=True)
-    compared = evaluate(result)
     table = _table("segment", "nodes", "pings", "down-weighted", "median sd, m", "status")
     for segment in result.segments:
         sd = segment.trajectory.covariance[:, [0, 1], [0, 1]].max(axis=1) ** 0.5
@@ -181,13 +182,11 @@ def _print_result(result: Result) -> None:
             segment.status,
         )
     _show(table)
-    if compared:
-        _print_errors({"against the reference": Errors.joined(compared.values())})
 
 
 def _print_errors(rows: dict[str, Errors]) -> None:
     table = _table(
-        "", "horizontal rmse, m", "interior rmse, m", "largest, m", "mean NEES (2 is true)"
+        "", "horizontal rmse, m", "interior rmse, m", "largest, m", "mean NEES (2 expected)"
     )
     for name, errors in rows.items():
         found = errors.summary()

@@ -6,6 +6,7 @@ too.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +17,12 @@ from matplotlib.patches import Ellipse
 from ubl_graph.arrays import FloatArray
 from ubl_graph.evaluation import evaluate
 from ubl_graph.result import Result, SegmentResult
+from ubl_graph.trajectory import Trajectory
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C6D1F")
 GREY, RED = "#7F7F7F", "#B2182B"
+#: Tracks by their name, to draw beside the smoothed one.
+Beside = Mapping[str, Sequence[Trajectory]]
 #: Axis label, factor from SI, per component of a slow state.
 SLOW_LABELS = {
     "clock_offset": (("clock offset, ms", 1e3),),
@@ -29,9 +33,9 @@ SLOW_LABELS = {
 ELLIPSE_95 = 2.4477
 
 
-def save_all(result: Result, folder: Path) -> None:
+def save_all(result: Result, folder: Path, beside: Beside | None = None) -> None:
     """Draw every figure that the result has data for into `folder` as PNG."""
-    figures: dict[str, Figure] = {"track": track(result)}
+    figures: dict[str, Figure] = {"track": track(result, beside)}
     if result.residuals is not None:
         figures["residuals"] = residuals(result)
     for name in dict.fromkeys(name for s in result.segments for name in s.slow):
@@ -42,8 +46,16 @@ def save_all(result: Result, folder: Path) -> None:
         figure.savefig(folder / f"{name}.png", dpi=130)
 
 
-def track(result: Result) -> Figure:
-    """Map of the smoothed track with 95 % ellipses, beacons, and the reference where known."""
+def track(result: Result, beside: Beside | None = None) -> Figure:
+    """Map of the smoothed track with 95 % ellipses, beacons, and the reference where known.
+
+    Parameters
+    ----------
+    result : Result
+        What to draw.
+    beside : mapping of str to sequence of Trajectory, optional
+        Further tracks by their name in the legend.
+    """
     figure = Figure(figsize=(8.0, 7.0), layout="constrained")
     axes = figure.subplots()
     _draw_reference(axes, result)
@@ -54,6 +66,10 @@ def track(result: Result) -> Figure:
         label = segment.name or "smoothed"
         axes.plot(east, north, color=colour, lw=1.4, label=label, zorder=3)
         _draw_ellipses(axes, segment, enlarged, colour)
+    for name, tracks in (beside or {}).items():
+        for i, other in enumerate(tracks):
+            label = None if i else name
+            axes.plot(*other.position[:, :2].T, color=RED, lw=1.0, ls="-.", label=label, zorder=2)
     _draw_beacons(axes, result)
     axes.set_xlabel("east, m")
     axes.set_ylabel("north, m")

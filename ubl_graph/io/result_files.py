@@ -11,7 +11,7 @@ import json
 import platform
 import shutil
 import tempfile
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -24,6 +24,7 @@ from ubl_graph.errors import DataError
 from ubl_graph.evaluation import Errors, evaluate
 from ubl_graph.io.resolved import resolved
 from ubl_graph.result import RangeResiduals, Result, SegmentResult, SlowState
+from ubl_graph.trajectory import Trajectory
 
 #: Columns of trajectory.csv; docs/outputs.md says what they hold.
 TRAJECTORY_COLUMNS = (
@@ -43,7 +44,12 @@ SLOW_COMPONENTS = {
 }
 
 
-def write_result(result: Result, folder: str | Path, figures: bool = True) -> list[Path]:
+def write_result(
+    result: Result,
+    folder: str | Path,
+    figures: bool = True,
+    beside: Mapping[str, Sequence[Trajectory]] | None = None,
+) -> list[Path]:
     """Write everything that `ubl-graph smooth` leaves behind.
 
     Parameters
@@ -54,6 +60,8 @@ def write_result(result: Result, folder: str | Path, figures: bool = True) -> li
         Made where it is missing. Files of the same names in it are replaced, others stay.
     figures : bool
         Whether to draw figures (PNG).
+    beside : mapping of str to sequence of Trajectory, optional
+        Further tracks to draw on the map, by their name in the legend.
 
     Returns
     -------
@@ -78,7 +86,7 @@ def write_result(result: Result, folder: str | Path, figures: bool = True) -> li
         if figures:
             from ubl_graph import plots  # matplotlib is heavy: only who draws pays for it
 
-            plots.save_all(result, stage)
+            plots.save_all(result, stage, beside)
         names = sorted(p.name for p in stage.iterdir())
     return [folder / name for name in names]
 
