@@ -3,7 +3,6 @@ from __future__ import annotations
 import csv
 import json
 import math
-import os
 import pickle
 from itertools import pairwise
 from pathlib import Path
@@ -17,9 +16,6 @@ from scipy.optimize import brentq
 
 from ubl_graph.acoustics import SoundSpeedProfile, TravelTimes, eigenray, straight
 from ubl_graph.errors import ConfigurationError, DataError, NoDirectRayError
-
-DATA = Path(os.environ.get("UBL_GRAPH_DATA", Path(__file__).parents[2] / "shared" / "data"))
-SAGA = DATA / "garpos"
 
 # A thermocline over a sound channel, with an isovelocity layer and steps of either sign.
 OCEAN = SoundSpeedProfile(
@@ -652,14 +648,12 @@ def rotated(angles: np.ndarray, offset: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def saga() -> tuple[TravelTimes, TravelTimes, np.ndarray, np.ndarray]:
-    if not SAGA.is_dir():
-        pytest.skip(f"no SAGA data in {SAGA}; set UBL_GRAPH_DATA to the folder that holds garpos/")
-    svp = np.loadtxt(SAGA / "SAGA.1903.kaiyo_k4-svp.csv", delimiter=",", skiprows=1)
+def real_times(saga: Path) -> tuple[TravelTimes, TravelTimes, np.ndarray, np.ndarray]:
+    svp = np.loadtxt(saga / "SAGA.1903.kaiyo_k4-svp.csv", delimiter=",", skiprows=1)
     profile = SoundSpeedProfile(svp[:, 0], svp[:, 1])
-    solution = json.loads((SAGA / "SAGA.1903-garpos-solution.json").read_text())["beacons"]
+    solution = json.loads((saga / "SAGA.1903-garpos-solution.json").read_text())["beacons"]
     offset = np.array([1.5547, -1.2690, 23.7295])
-    with (SAGA / "SAGA.1903.kaiyo_k4-obs.csv").open() as file:
+    with (saga / "SAGA.1903.kaiyo_k4-obs.csv").open() as file:
         next(file)
         pings = [row for row in csv.DictReader(file) if row["flag"] == "False"]
 
@@ -676,8 +670,8 @@ def saga() -> tuple[TravelTimes, TravelTimes, np.ndarray, np.ndarray]:
     return eigenray(profile, send, beacon), eigenray(profile, beacon, receive), measured, sent
 
 
-def test_real_two_way_times_are_matched_as_well_as_the_sound_speed_allows(saga):
-    out, back, measured, sent = saga
+def test_real_two_way_times_are_matched_as_well_as_the_sound_speed_allows(real_times):
+    out, back, measured, sent = real_times
     assert out.found.all() and back.found.all()
     # The data's README says 0.84 and 0.24 ms, which is without the 17 outliers.
     residual = 1e3 * (out.time + back.time - measured)

@@ -35,13 +35,8 @@ def smoothed(path: Path) -> tuple[ubl_graph.Result, dict]:
     return result, Errors.joined(evaluate(result).values()).summary()
 
 
-@pytest.fixture
-def garpos(data_folder: Path) -> Path:
-    return data_folder / "garpos"
-
-
-def test_straight_lines_with_a_profile(tmp_path, garpos):
-    result, errors = smoothed(mission_file(tmp_path, garpos))
+def test_straight_lines_with_a_profile(tmp_path, saga):
+    result, errors = smoothed(mission_file(tmp_path, saga))
     assert result.status == "converged"
     assert errors["count"] == 1886
     assert errors["interior_horizontal_rmse_m"] < 0.30
@@ -49,9 +44,9 @@ def test_straight_lines_with_a_profile(tmp_path, garpos):
     assert 0.7 < errors["interior_mean_nees_2dof"] < 3.0
 
 
-def test_straight_lines_with_a_nominal_speed_and_straight_rays(tmp_path, garpos):
+def test_straight_lines_with_a_nominal_speed_and_straight_rays(tmp_path, saga):
     """The true mean speed is 1488.7 m/s."""
-    result, errors = smoothed(mission_file(tmp_path, garpos, sound_speed="1500.0"))
+    result, errors = smoothed(mission_file(tmp_path, saga, sound_speed="1500.0"))
     assert not result.mission.uses_eigenrays
     assert errors["interior_horizontal_rmse_m"] < 0.42
     assert errors["interior_mean_nees_2dof"] < 4.0
@@ -82,14 +77,14 @@ def command(*args: str | Path) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_the_estimator_sees_nothing_of_the_ships_east_and_north(tmp_path, garpos):
+def test_the_estimator_sees_nothing_of_the_ships_east_and_north(tmp_path, saga):
     moved = tmp_path / "moved.csv"
-    moved_observations(garpos / "SAGA.1903.kaiyo_k4-obs.csv", moved, 5000.0)
+    moved_observations(saga / "SAGA.1903.kaiyo_k4-obs.csv", moved, 5000.0)
     lines = json.dumps(["S01/L02", "S02/L09"])
-    plain = mission_file(tmp_path, garpos, lines=lines)
+    plain = mission_file(tmp_path, saga, lines=lines)
     out = tmp_path / "a"
     assert command("smooth", plain, "-o", out, "--no-figures").returncode == 0
-    shifted = mission_file(tmp_path, garpos, lines=lines, observations=f'"{moved}"')
+    shifted = mission_file(tmp_path, saga, lines=lines, observations=f'"{moved}"')
     assert command("smooth", shifted, "-o", tmp_path / "b", "--no-figures").returncode == 0
     first, second = (tmp_path / name / "trajectory.csv" for name in "ab")
     assert first.read_bytes() == second.read_bytes()
@@ -99,9 +94,9 @@ def test_the_estimator_sees_nothing_of_the_ships_east_and_north(tmp_path, garpos
 
 
 @pytest.mark.slow
-def test_all_lines_and_circles_with_the_configs_own_beacons(tmp_path, garpos):
+def test_all_lines_and_circles_with_the_configs_own_beacons(tmp_path, saga):
     """A-priori beacon positions are off by some 0.2 m; circles and a bend are in, too."""
-    path = mission_file(tmp_path, garpos)
+    path = mission_file(tmp_path, saga)
     text = [r for r in path.read_text().splitlines() if not r.startswith(("lines", "beacons"))]
     path.write_text("\n".join(text) + "\n")
     result, errors = smoothed(path)
@@ -111,8 +106,8 @@ def test_all_lines_and_circles_with_the_configs_own_beacons(tmp_path, garpos):
 
 
 @pytest.mark.slow
-def test_the_whole_command_writes_what_it_says(tmp_path, garpos):
-    path = mission_file(tmp_path, garpos)
+def test_the_whole_command_writes_what_it_says(tmp_path, saga):
+    path = mission_file(tmp_path, saga)
     done = command("smooth", path, "-o", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""

@@ -240,3 +240,22 @@ def test_without_depth_sensor(seed: int):
     off = result.trajectory.position[:, 2] - truth.position(result.trajectory.t)[:, 2]
     sigma = np.sqrt(result.trajectory.covariance[:, 2, 2])
     assert (np.abs(off) < 5.0 * sigma).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_one_beacon_without_odometry_is_never_called_converged(seed: int):
+    """A start tells the place, not the side to which the track leaves it."""
+    rng = np.random.default_rng(seed)
+    east, north = rng.uniform(-400.0, -200.0), rng.uniform(80.0, 250.0)
+    truth = constant_velocity([east, north, -20.0], [1.5, 0.0, 0.0], (0.0, 415.0))
+    beacon = Beacon("B1", [0.0, 0.0, -200.0], turnaround=0.1)
+    segment = Segment(
+        two_way_range=two_way_pings(
+            truth, (beacon,), np.arange(0.0, 410.0, 5.0), Sea(PROFILE), rng
+        ),
+        depth=pressure(truth, np.arange(0.0, 412.0), rng),
+        start=Start(0.0, east, north, sigma=20.0),
+    )
+    result = smooth(Mission((segment,), (beacon,), PROFILE))
+    assert result.status == "unobservable"
+    assert "ambiguous" in result.reason

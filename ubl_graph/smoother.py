@@ -30,8 +30,8 @@ AMBIGUOUS_COST = 3.0
 COVERED_SIGMAS = 3.0
 #: Outliers are a few per cent; where a fifth of the pings disagree, something else is wrong.
 SUSPICIOUS_SHARE = 0.2
-#: Sigmas would have to be three times too small to explain this.
-SUSPICIOUS_CHI_SQUARE = 9.0
+#: Sigmas would have to be twice too small to explain this.
+SUSPICIOUS_CHI_SQUARE = 4.0
 
 #: Called with what is being done and how far the whole is, 0 to 1.
 Progress = Callable[[str, float], None]
