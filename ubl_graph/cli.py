@@ -185,9 +185,7 @@ def _print_segments(result: Result) -> None:
 
 
 def _print_errors(rows: dict[str, Errors]) -> None:
-    table = _table(
-        "", "horizontal rmse, m", "interior rmse, m", "largest, m", "mean NEES (2 expected)"
-    )
+    table = _table("horizontal error", "rmse, m", "interior, m", "largest, m", "NEES (2 expected)")
     for name, errors in rows.items():
         found = errors.summary()
         table.add_row(

@@ -205,6 +205,7 @@ class _Work:
     wall_times: dict[str, float] = field(default_factory=dict[str, float])
     _done: float = 0.0
     _share: float = 1.0
+    _told: float = 0.0
 
     def begin(self, done: float, share: float) -> None:
         self._done, self._share = done, share
@@ -221,8 +222,10 @@ class _Work:
         self.wall_times[name] = self.wall_times.get(name, 0.0) + perf_counter() - begin
 
     def tell(self, text: str, share: float) -> None:
+        # Never backwards: a stage that begins knows less of the whole than the one that ended.
+        self._told = max(self._told, self._done + self._share * share)
         if self.progress is not None:
-            self.progress(text, self._done + self._share * share)
+            self.progress(text, self._told)
 
     def solve(self, problem: Problem, x: FloatArray) -> Solution:
         most = self.mission.options.max_iterations
