@@ -126,7 +126,7 @@ def dvl_vehicle(seed: int, options: Options) -> tuple[Mission, Truth, DvlErrors]
         tuple(angles),
         tuple(options.dvl_bias_sigma * rng.standard_normal(3)),
     )
-    # On an even keel an attitude's lasting error turns the odometry as a misalignment does.
+    # An attitude's lasting error of roll and pitch turns the odometry as a misalignment does.
     lasting = ATTITUDE_SIGMA * rng.standard_normal(3)
     scale = wander(rng, CONSTANT_SIGMA, options.sound_speed_walk, span)
     sent = np.arange(0.0, DURATION, 5.0)
@@ -138,28 +138,29 @@ def dvl_vehicle(seed: int, options: Options) -> tuple[Mission, Truth, DvlErrors]
         depth=pressure(truth, np.arange(0.0, DURATION + 1.0, 2.0), rng),
         start=Start(0.0, start[0], start[1], sigma=10.0),
     )
-    # Heading, pitch and roll turn about down, right and forward; what undoes them is opposite.
-    both = tuple(angles + lasting[[2, 1, 0]] * [-1.0, 1.0, 1.0])
-    return (
-        Mission((segment,), BEACONS[:2], PROFILE, options=options),
-        truth,
-        replace(errors, misalignment=both),
-    )
+    # Pitch and roll turn about right and forward; what undoes them is opposite.
+    truths = {
+        "dvl_scale": errors.scale,
+        "dvl_misalignment": np.add(angles, [-lasting[2], lasting[1], 0.0]),
+        "dvl_bias": errors.bias,
+        "heading_bias": lasting[0],
+    }
+    return Mission((segment,), BEACONS[:2], PROFILE, options=options), truth, truths
 
 
 @cache
 def dvl_runs(runs: int) -> tuple[list[Nees], dict[str, list[float]]]:
     out: list[Nees] = []
-    states: dict[str, list[float]] = {"scale": [], "misalignment": [], "bias": []}
+    states: dict[str, list[float]] = {}
     for seed in range(runs):
-        mission, truth, errors = dvl_vehicle(seed, Options(loss="none"))
+        mission, truth, truths = dvl_vehicle(seed, Options(loss="none"))
         result = smooth(mission)
         assert result.status == "converged", f"seed {seed}: {result.reason}"
         out.append(node_nees(result, truth))
-        for name, values in states.items():
-            found = result.shared[f"dvl_{name}"]
-            off = found.value - np.atleast_1d(getattr(errors, name))
-            values.append(squared(off, found.covariance))
+        for name, value in truths.items():
+            found = result.shared[name]
+            off = found.value - np.atleast_1d(value)
+            states.setdefault(name, []).append(squared(off, found.covariance))
     return out, states
 
 
@@ -189,7 +190,7 @@ def test_default_loss_is_a_little_cautious(options: Options):
 def test_dvl():
     runs, states = dvl_runs(60)
     check(runs, "DVL")
-    for (name, values), dof in zip(states.items(), (1, 3, 3), strict=True):
+    for (name, values), dof in zip(states.items(), (1, 3, 3, 1), strict=True):
         assert_consistent(values, dof, f"DVL {name}")
 
 

@@ -320,3 +320,37 @@ def test_a_wandering_track_is_recovered_at_the_pings_to_centimetres():
     track = result.segments[0].trajectory
     off = track.position - truth.position(track.t)
     assert np.abs(off[10:-10]).max() < 0.05
+
+
+def test_heading_bias_of_a_vehicle_that_rolls():
+    """The reference reads two degrees too far clockwise; rolling tells it from a misalignment."""
+    truth = SWINGING.with_attitude(
+        lambda t: 0.02 * t, pitch=lambda t: 0.05 * np.sin(t / 3.0), roll=lambda t: 0.1 * np.sin(t)
+    )
+    bias = float(np.deg2rad(2.0))
+    times = np.arange(DVL_TIMES[0], DVL_TIMES[-1], 0.05)
+    segment = Segment(
+        two_way_range=two_way(truth, Sea(CONSTANT)),
+        depth=depth(truth),
+        velocity=dvl(truth, times, rng(), noise=0.0),
+        attitude=replace(ahrs(truth, times, error=(bias, 0.0, 0.0)), sigma=1.0),
+    )
+    result = solved(segment, replace(FREE, dvl_misalignment_sigma_deg=0.0))
+    # Two degrees, to first order: the second is 0.6 mm on the metre.
+    np.testing.assert_allclose(result.shared["heading_bias"].value, bias, rtol=1e-3)
+
+
+@pytest.mark.parametrize("offset", [0.2, -8.0, 12.0, 45.0])
+def test_clocks_that_differ_by_up_to_a_minute(offset: float):
+    clock = Clock(offset=offset, drift=0.0)
+    truth = TRACKS["constant_velocity"]
+    sent = PINGS - offset  # by the beacons' clock
+    heard = one_way_pings(truth, BEACONS, sent, Sea(CONSTANT), rng(), clock=clock, noise=0.0)
+    result = solved(Segment(one_way_range=heard, depth=depth(truth)), Options())
+    assert_recovered(result, truth)
+
+
+def test_default_options_pull_a_noiseless_track_by_less_than_a_tenth_of_a_millimetre():
+    for motion, truth in TRACKS.items():
+        segment = Segment(two_way_range=two_way(truth, Sea(CONSTANT)), depth=depth(truth))
+        assert_recovered(solved(segment, Options(motion=motion)), truth)

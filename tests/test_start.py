@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from problems import problem_of
 
 from ubl_graph import (
     Beacon,
@@ -31,6 +32,7 @@ from ubl_graph.sim import (
     straight_pass,
     two_way_pings,
 )
+from ubl_graph.solve.lm import solve
 
 PROFILE = SoundSpeedProfile.constant(1500.0)
 SPAN = (0.0, 210.0)
@@ -259,3 +261,43 @@ def test_one_beacon_without_odometry_is_never_called_converged(seed: int):
     result = smooth(Mission((segment,), (beacon,), PROFILE))
     assert result.status == "unobservable"
     assert "ambiguous" in result.reason
+
+
+@pytest.mark.parametrize(("begin", "end"), [(100.0, 210.0), (0.0, 90.0), (60.0, 120.0)])
+def test_odometry_that_begins_late_or_ends_early(begin: float, end: float):
+    """Without bottom lock on the way down the vehicle moves all the same."""
+    rng = np.random.default_rng(4)
+    truth = constant_velocity([-150.0, -150.0, -60.0], [1.1, 1.4, 0.0], SPAN)
+    t = np.arange(begin, end, 0.5)
+    segment = Segment(
+        two_way_range=two_way_pings(truth, FOUR, np.arange(0.0, 200.0, 5.0), Sea(PROFILE), rng),
+        velocity=dvl(truth, t[t < 206.0], rng),
+        attitude=ahrs(truth, np.arange(0.0, 206.0)),
+        depth=pressure(truth, np.arange(0.0, 206.0), rng),
+    )
+    result = smooth(Mission((segment,), FOUR, PROFILE))
+    assert result.status == "converged", result.reason
+    assert error(result, truth) < 0.5
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_outliers_do_not_choose_the_minimum(seed: int):
+    """A tenth of the pings up to 20 ms long: no dearer an answer than from the clean track."""
+    mission, _ = random_mission(seed)
+    pings = mission.segments[0].two_way_range
+    assert pings is not None
+    pings = replace(pings, t_receive=pings.t_receive + 0.03)
+    clean = smooth(with_segment(mission, two_way_range=pings))
+    rng = np.random.default_rng([seed, 3])
+    late = rng.uniform(0.5e-3, 20e-3, len(pings)) * (rng.random(len(pings)) < 0.1)
+    mission = with_segment(
+        mission, two_way_range=replace(pings, travel_time=pings.travel_time + late)
+    )
+    result = smooth(mission)
+    assert result.status == "converged", result.reason
+    problem = problem_of(mission)
+    x = np.zeros(problem.layout.size)
+    for name in ("position", "velocity"):
+        problem.layout.put(x, name, getattr(clean.trajectory, name))
+    problem.layout.put(x, "sound_speed", clean.segments[0].slow["sound_speed"].value)
+    assert result.segments[0].cost <= solve(problem, x).cost + 1e-3

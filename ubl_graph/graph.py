@@ -33,7 +33,7 @@ from ubl_graph.trajectory import inside, interpolation_variance
 #: deviation of its size in the result says just that.
 FREE_POSITION = 1e5
 #: The same for the acceleration, m/s^2.
-FREE_ACCELERATION = 1.0
+FREE_ACCELERATION = 100.0
 #: Noise density of the motion prior where odometry joins the nodes, m^2/s^3 or m^2/s^5: there
 #: the prior has nothing to say, and a vehicle that turns must not be pulled straight.
 ODOMETRY_PSD = 1.0
@@ -126,27 +126,27 @@ def _layout(mission: Mission, models: Sequence[SegmentModel]) -> Layout:
     shared: list[tuple[str, int]] = []
     if any(model.bottom is not None or model.water is not None for model in models):
         sigmas = _dvl_sigmas(options, models)
-        shared += [(name, size) for name, size in DVL_STATES if sigmas[name] > 0.0]
+        shared += [(name, size) for name, size in DVL_STATES if sigmas[name][-1] > 0.0]
     if options.estimate_beacons:
         shared += [(f"beacon {b.name}", 3) for b in mission.beacons]
     return Layout(tuple(chains), order_of(options), tuple(slow), tuple(shared))
 
 
-def _dvl_sigmas(options: Options, models: Sequence[SegmentModel]) -> dict[str, float]:
-    """Prior standard deviations of the DVL's errors.
+def _dvl_sigmas(options: Options, models: Sequence[SegmentModel]) -> dict[str, FloatArray]:
+    """Prior standard deviations of the DVL's errors, and of the heading reference's.
 
-    A heading reference's error lasts and turns the odometry just as a misaligned DVL does, so
-    one state carries both.
+    Lasting errors of roll and pitch turn the odometry as a misalignment about forward and left
+    does, so its states carry both.
     """
-    misalignment = float(np.deg2rad(options.dvl_misalignment_sigma_deg))
-    if misalignment > 0.0:
-        attitudes = [m.segment.attitude for m in models if m.segment.attitude is not None]
-        typical = max((float(np.median(a.sigma)) for a in attitudes), default=0.0)
-        misalignment = float(np.hypot(misalignment, typical))
+    attitudes = [m.segment.attitude for m in models if m.segment.attitude is not None]
+    lasting = max((float(np.median(a.sigma)) for a in attitudes), default=0.0)
+    mounting = float(np.deg2rad(options.dvl_misalignment_sigma_deg))
+    level = float(np.hypot(mounting, lasting))
     return {
-        "dvl_scale": options.dvl_scale_sigma,
-        "dvl_misalignment": misalignment,
-        "dvl_bias": options.dvl_bias_sigma,
+        "dvl_scale": np.array([options.dvl_scale_sigma]),
+        "dvl_misalignment": np.array([level, level, mounting]),
+        "dvl_bias": np.full(3, options.dvl_bias_sigma),
+        "heading_bias": np.array([lasting]),
     }
 
 

@@ -33,6 +33,7 @@ LETTERS = {
     "dvl_scale": "s",
     "dvl_misalignment": "m",
     "dvl_bias": "o",
+    "heading_bias": "q",
 }
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 from ubl_graph.arrays import FloatArray
-from ubl_graph.graph import FREE_ACCELERATION, FREE_POSITION, SegmentModel
+from ubl_graph.graph import FREE_POSITION, SegmentModel
 from ubl_graph.mission import Mission, Segment, Start
 from ubl_graph.nodes import order_of
 from ubl_graph.reckoning import DeadReckoning
@@ -38,8 +38,8 @@ from ubl_graph.windows import (
 WINDOW_RANGES = 24
 #: Ranges that a window should hold before it is worth fitting; it is made longer until it does.
 FEWEST_RANGES = 6
-#: Speeds are searched around zero within this, m/s.
-WINDOW_SPEED = 10.0
+#: Speeds (m/s) and accelerations (m/s^2) are searched around zero within these.
+WINDOW_SPEED, WINDOW_ACCELERATION = 10.0, 1.0
 #: With odometry the shape of the track is known, so a window may be so many times longer.
 ODOMETRY_WINDOWS = 5.0
 #: What dead reckoning may be off by, as a share of the way and at the least, m.
@@ -88,41 +88,60 @@ def find_starts(mission: Mission, model: SegmentModel) -> Starts:
     """
     reckoning = DeadReckoning(mission, model)
     segment = model.segment
-    windows = [_fit_window(mission, segment, reckoning, *w) for w in _windows(mission, reckoning)]
+    spans = _windows(mission, reckoning)
+    windows = [_fit_window(mission, segment, reckoning, span) for span in spans]
     own = [window.cost for window in windows]
-    steps = [_step_cost(mission, a, b, reckoning) for a, b in pairwise(windows)]
+    steps = [
+        _step_cost(mission, a, b, pair)
+        for (a, b), pair in zip(pairwise(windows), pairwise(spans), strict=True)
+    ]
     ways = _cheapest_ways(own, steps)
     tracks = [_track(model, reckoning, windows, way, cost) for way, cost in ways]
     sigmas = None
     at = _start_window(windows, segment)
     if at is not None and segment.start is not None:
-        sigmas = float(_start_sigmas(windows[at], reckoning, segment.start)[ways[0][0][at]])
+        sigmas = float(
+            _start_sigmas(windows[at], spans[at], reckoning, segment.start)[ways[0][0][at]]
+        )
     return Starts(tuple(_apart(tracks)), sigmas)
 
 
-def _windows(mission: Mission, reckoning: DeadReckoning) -> list[tuple[float, float]]:
-    """Spans of the windows: as long as asked, longer where ranges are few."""
+@dataclass(frozen=True)
+class _Window:
+    """Span of a window, s, and whether odometry covers it."""
+
+    begin: float
+    end: float
+    reckoned: bool
+
+
+def _windows(mission: Mission, reckoning: DeadReckoning) -> list[_Window]:
+    """Windows as long as asked, longer where ranges are few, never across an end of odometry."""
     s = reckoning.sightings
     times = np.sort(np.concatenate([s.t[:, 0], s.fix_t]))
+    breaks = reckoning.breaks()
+    ends = np.append(np.searchsorted(times, breaks[(breaks > times[0])]), len(times))
     length = mission.options.start_window
-    if reckoning.odometry is not None:
-        length *= ODOMETRY_WINDOWS
-    spans: list[tuple[float, float]] = []
+    windows: list[_Window] = []
     first = 0
     while first < len(times):
-        last = int(np.searchsorted(times, times[first] + length, side="right"))
-        last = min(max(last, first + FEWEST_RANGES), len(times))
-        if len(times) - last < FEWEST_RANGES:
-            last = len(times)
-        spans.append((float(times[first]), float(times[last - 1])))
+        stop = int(ends[ends > first].min())
+        reckoned = reckoning.covers(float(times[first]), float(times[stop - 1]))
+        span = ODOMETRY_WINDOWS * length if reckoned else length
+        last = int(np.searchsorted(times, times[first] + span, side="right"))
+        last = min(max(last, first + FEWEST_RANGES), stop)
+        if stop - last < FEWEST_RANGES:
+            last = stop
+        windows.append(_Window(float(times[first]), float(times[last - 1]), reckoned))
         first = last
-    return spans
+    return windows
 
 
 def _fit_window(
-    mission: Mission, segment: Segment, reckoning: DeadReckoning, begin: float, end: float
+    mission: Mission, segment: Segment, reckoning: DeadReckoning, window: _Window
 ) -> Hypotheses:
     s = reckoning.sightings
+    begin, end = window.begin, window.end
     rows = (s.t[:, 0] >= begin) & (s.t[:, 0] <= end)
     fixes = (s.fix_t >= begin) & (s.fix_t <= end)
     for chosen in (rows, fixes):
@@ -132,7 +151,7 @@ def _fit_window(
             chosen[:] = False
             chosen[keep] = True
     middle = 0.5 * (begin + end)
-    prior = _window_prior(mission, segment, reckoning)
+    prior = _window_prior(mission, segment, reckoning, window.reckoned)
     extra = None
     if segment.start is not None:
         extra = prior.mean[None].copy()
@@ -143,12 +162,14 @@ def _fit_window(
         s.select(rows, fixes),
         middle,
         prior,
-        _model_sigma(mission, reckoning, begin, end),
+        _model_sigma(mission, reckoning, window),
         extra,
     )
 
 
-def _window_prior(mission: Mission, segment: Segment, reckoning: DeadReckoning) -> Prior:
+def _window_prior(
+    mission: Mission, segment: Segment, reckoning: DeadReckoning, reckoned: bool
+) -> Prior:
     options = mission.options
     mean, sigma = np.zeros(PARAMETERS), np.empty(PARAMETERS)
     if mission.beacons:
@@ -163,13 +184,13 @@ def _window_prior(mission: Mission, segment: Segment, reckoning: DeadReckoning) 
             sigma[2] = FREE_POSITION
         sigma[5] = 0.5
     speed = min(options.speed_sigma, WINDOW_SPEED)
-    if reckoning.odometry is not None:
+    if reckoned:
         water = reckoning.odometry is not reckoning.model.bottom
         speed = np.hypot(ODOMETRY_SPEED, options.current_sigma if water else 0.0)
     sigma[3:5] = speed
     # Only the constant-acceleration prior lets a window bend; odometry knows the bends already.
-    bends = order_of(options) == 3 and reckoning.odometry is None
-    sigma[ACCELERATION] = FREE_ACCELERATION if bends else 1e-9
+    bends = order_of(options) == 3 and not reckoned
+    sigma[ACCELERATION] = WINDOW_ACCELERATION if bends else 1e-9
     if reckoning.depth is not None:
         sigma[8] = 1e-9
     sigma[SCALE] = mission.sound_speed_sigma + 1e-6 if options.estimate_sound_speed else 1e-6
@@ -177,17 +198,16 @@ def _window_prior(mission: Mission, segment: Segment, reckoning: DeadReckoning) 
     return Prior(mean, sigma)
 
 
-def _model_sigma(mission: Mission, reckoning: DeadReckoning, begin: float, end: float) -> float:
+def _model_sigma(mission: Mission, reckoning: DeadReckoning, window: _Window) -> float:
     """What the true motion may deviate from the window's model by, m."""
-    span = end - begin
-    if reckoning.odometry is None:
+    span = window.end - window.begin
+    if not window.reckoned:
         # What the motion prior does between the window's ends.
         order = order_of(mission.options)
         variance = interpolation_variance(order, np.array(span), np.array(0.5))
         return float(np.sqrt(mission.options.horizontal_psd * variance)) + 0.1
-    way = np.linalg.norm(
-        np.diff(reckoning.offset(np.linspace(begin, end, 20))[:, :2], axis=0), axis=1
-    )
+    places = reckoning.offset(np.linspace(window.begin, window.end, 20))[:, :2]
+    way = np.linalg.norm(np.diff(places, axis=0), axis=1)
     return ODOMETRY_SLACK + ODOMETRY_SHARE * float(way.sum())
 
 
@@ -227,29 +247,42 @@ def _viterbi(own: list[FloatArray], steps: list[FloatArray]) -> list[tuple[list[
 
 
 def _step_cost(
-    mission: Mission, a: Hypotheses, b: Hypotheses, reckoning: DeadReckoning
+    mission: Mission, a: Hypotheses, b: Hypotheses, spans: tuple[_Window, _Window]
 ) -> FloatArray:
     """Price of going from each answer of one window to each of the next, (H_a, H_b).
 
-    Half the squared Mahalanobis distance of the two answers' states, both carried to the time
-    half way between the windows' middles.
+    Half the squared Mahalanobis distance of the two answers' states, both carried to where one
+    window ends and the next begins.
     """
-    half = 0.5 * (b.t - a.t)
-    carried = [_carried(a, half), _carried(b, -half)]
-    gap = carried[0][0][:, None, :] - carried[1][0][None, :, :]
+    meeting = 0.5 * (spans[0].end + spans[1].begin)
     wander = np.zeros((PARAMETERS, PARAMETERS))
-    if reckoning.odometry is None:
-        order = order_of(mission.options)
-        noise = 2.0 * mission.options.horizontal_psd * process_noise(order, half)[0]
+    carried: list[tuple[FloatArray, FloatArray]] = []
+    for window, span in zip((a, b), spans, strict=True):
+        carried.append(_carried(window, meeting - window.t))
+        wander += _wander(mission, abs(meeting - window.t), span.reckoned)
+    if spans[0].reckoned != spans[1].reckoned:
+        # On one side the velocity is the vehicle's, on the other the odometry's error.
+        wander[VELOCITY, VELOCITY] += WINDOW_SPEED**2 * np.eye(3)
+        wander[ACCELERATION, ACCELERATION] += WINDOW_ACCELERATION**2 * np.eye(3)
+    gap = carried[0][0][:, None, :] - carried[1][0][None, :, :]
+    spread = carried[0][1][:, None] + carried[1][1][None, :] + wander
+    return 0.5 * np.einsum("abi,abi->ab", gap, np.linalg.solve(spread, gap[..., None])[..., 0])
+
+
+def _wander(mission: Mission, dt: float, reckoned: bool) -> FloatArray:
+    """What a window's model may have strayed from the truth after `dt` seconds, (11, 11)."""
+    if reckoned:
+        noise = np.diag([ODOMETRY_SLACK**2 + (ODOMETRY_SPEED * dt) ** 2, ODOMETRY_SPEED**2])
     else:
-        noise = np.diag([ODOMETRY_SLACK**2 + (ODOMETRY_SPEED * half) ** 2, ODOMETRY_SPEED**2])
+        order = order_of(mission.options)
+        noise = mission.options.horizontal_psd * process_noise(order, dt + 1e-3)[0]
+    wander = np.zeros((PARAMETERS, PARAMETERS))
     for axis in range(3):
         states = axis + 3 * np.arange(len(noise))
         wander[np.ix_(states, states)] = noise
     wander[SCALE, SCALE] = (1e-4) ** 2
-    wander[CLOCK, CLOCK] = (1e-4 + mission.options.clock_drift_sigma * half) ** 2
-    spread = carried[0][1][:, None] + carried[1][1][None, :] + wander
-    return 0.5 * np.einsum("abi,abi->ab", gap, np.linalg.solve(spread, gap[..., None])[..., 0])
+    wander[CLOCK, CLOCK] = (1e-4 + min(mission.options.clock_drift_sigma, 1e-5) * dt) ** 2
+    return wander
 
 
 def _carried(window: Hypotheses, dt: float) -> tuple[FloatArray, FloatArray]:
@@ -267,16 +300,14 @@ def _start_window(windows: list[Hypotheses], segment: Segment) -> int | None:
     return int(np.argmin([abs(w.t - segment.start.t) for w in windows]))
 
 
-def _start_sigmas(window: Hypotheses, reckoning: DeadReckoning, start: Start) -> FloatArray:
+def _start_sigmas(
+    window: Hypotheses, span: _Window, reckoning: DeadReckoning, start: Start
+) -> FloatArray:
     """Mahalanobis distance of each of a window's answers from the start prior, (H,)."""
     dt = start.t - window.t
     parameters, covariance = _carried(window, dt)
     position = parameters[:, :2] + reckoning.offset(np.array([start.t]))[0, :2]
-    if reckoning.odometry is None:
-        options = reckoning.mission.options
-        wander = options.horizontal_psd * process_noise(order_of(options), abs(dt) + 1e-9)[0, 0, 0]
-    else:
-        wander = (ODOMETRY_SPEED * dt) ** 2
+    wander = _wander(reckoning.mission, abs(dt), span.reckoned)[0, 0]
     gap = position - [start.east, start.north]
     spread = covariance[:, :2, :2] + (start.sigma**2 + wander) * np.eye(2)
     return np.sqrt(np.einsum("hi,hi->h", gap, np.linalg.solve(spread, gap[..., None])[..., 0]))

@@ -28,6 +28,7 @@ UNITS: dict[str, float] = {
     "dvl_scale": 1e-3,
     "dvl_misalignment": 1e-2,
     "dvl_bias": 1e-2,
+    "heading_bias": 1e-2,
 }
 
 

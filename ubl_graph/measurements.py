@@ -21,6 +21,8 @@ from ubl_graph.records import Records, Source, record_error
 MAX_TRAVEL_TIME = 60.0
 #: A travel time may exceed receive minus transmit time by so much (clock granularity), s.
 STAMP_TOLERANCE = 0.1
+#: Positions farther from the origin than this are not local, m.
+MAX_DISTANCE = 1e7
 
 # One standard deviation of each kind where neither a column nor an option gives it.
 TRAVEL_TIME_SIGMA = 1e-4  #: s; modems and seafloor transponders reach 0.05 to 0.2 ms
@@ -67,6 +69,13 @@ class TwoWayRange(Records):
     }
 
     def _check(self) -> None:
+        self._forbid(
+            self.travel_time < 1e-5,
+            "travel_time",
+            self.travel_time,
+            " s: sound goes no way in that time",
+            "drop pings without a reply",
+        )
         span = self.t_receive - self.t_transmit
         self._forbid(
             span < 0.0,
@@ -81,6 +90,13 @@ class TwoWayRange(Records):
             self.travel_time,
             " s is longer than the time between transmit and receive",
             "both in seconds? the turnaround is part of neither",
+        )
+        self._forbid(
+            span > self.travel_time + MAX_TRAVEL_TIME,
+            "t_receive",
+            self.t_receive,
+            f" s is over {MAX_TRAVEL_TIME:g} s later than ping and travel time explain",
+            "is it the reply to this ping?",
         )
 
     @classmethod
@@ -332,7 +348,12 @@ class PositionFix(Records):
     covariance: Any = None
     source: Source | None = None
 
-    LIMITS: ClassVar = {"sigma": (1e-6, 1e6, "m")}
+    LIMITS: ClassVar = {
+        "east": (-MAX_DISTANCE, MAX_DISTANCE, "m"),
+        "north": (-MAX_DISTANCE, MAX_DISTANCE, "m"),
+        "up": (-MAX_DISTANCE, MAX_DISTANCE, "m"),
+        "sigma": (1e-6, 1e6, "m"),
+    }
 
     def __post_init__(self) -> None:
         if self.covariance is not None:

@@ -20,6 +20,9 @@ from ubl_graph.records import Records
 #: Relative standard deviation of the sound speed at the start: a measured profile, a constant.
 PROFILE_SIGMA, CONSTANT_SIGMA = 1e-3, 5e-3
 
+#: Depth and attitude may begin or end so much before or after the ranges, s.
+EPOCH_SLACK = 600.0
+
 #: The record kinds of a segment: attribute, class, and the columns that make a duplicate.
 RECORD_KINDS: dict[str, tuple[type[Records], tuple[str, ...]]] = {
     "two_way_range": (TwoWayRange, ("beacon", "t_transmit", "t_receive")),
@@ -217,8 +220,31 @@ class Mission:
         for kind in ("two_way_range", "one_way_range"):
             if kind in records:
                 self._check_beacons(records[kind])
+        self._check_epochs(segment)
         self._check_attitude(segment, where)
         self._check_current(segment)
+
+    def _check_epochs(self, segment: Segment) -> None:
+        """Refuse depth and attitude that do not meet the ranges: they are of another epoch."""
+        spans = [
+            (float(np.min(r.t_receive)), float(np.max(r.t_receive)))
+            for r in (segment.two_way_range, segment.one_way_range)
+            if r is not None and len(r)
+        ]
+        if not spans:
+            return
+        begin, end = min(s[0] for s in spans), max(s[1] for s in spans)
+        for rows in (segment.depth, segment.attitude):
+            # One record may stand for all times.
+            if rows is None or len(rows) < 2:
+                continue
+            if rows.t.max() < begin - EPOCH_SLACK or rows.t.min() > end + EPOCH_SLACK:
+                raise rows.error(
+                    0,
+                    "t",
+                    f"{rows.t[0]} s: no record lies within the ranges' times, {begin} to {end} s",
+                    "are all files in the same epoch?",
+                )
 
     def _check_beacons(self, ranges: Any) -> None:
         unknown = ~np.isin(ranges.beacon, np.array(self.beacon_names, dtype=np.str_))

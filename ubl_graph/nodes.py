@@ -52,7 +52,12 @@ def node_times(
         )
     psd = max(options.horizontal_psd, options.vertical_psd)
     spacing = longest_interval(order_of(options), psd, INTERPOLATION_SHARE * min(sigmas))
-    stay = np.any(np.abs(wanted[:, None] - kept) <= SAME_INSTANT, axis=1)
+    stay = np.zeros(len(wanted), dtype=np.bool_)
+    after = np.searchsorted(wanted, kept).clip(1, max(len(wanted) - 1, 1))
+    before = after - 1
+    if len(wanted) > 1:
+        nearer = kept - wanted[before] < wanted[after] - kept
+        stay[np.where(nearer, before, after)] = True
     return _filled(_thinned(wanted, stay, spacing))
 
 

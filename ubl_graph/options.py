@@ -44,9 +44,9 @@ class Options:
     vertical_jerk_psd: float | None = None
     """The same for the vertical; left out, it equals the horizontal one."""
 
-    speed_sigma: float = 100.0
+    speed_sigma: float = 1000.0
     """What is known of the first velocity before any measurement: zero within this, m/s. So wide
-    that it pulls no estimate by more than micrometres."""
+    that it pulls no estimate; it only keeps the equations regular."""
 
     loss: Loss = "cauchy"
     """Robust loss on the acoustic ranges; its width gives 95 % efficiency on normal noise."""
@@ -80,11 +80,12 @@ class Options:
     current_walk: float = 2e-3
     """Random walk of the current, m/s per sqrt(s): 0.12 m/s in an hour."""
 
-    clock_offset_sigma: float = 1.0
-    """Standard deviation of the clock offset (vehicle - beacon) at the start, s."""
+    clock_offset_sigma: float = 60.0
+    """Standard deviation of the clock offset (vehicle - beacon) at the start, s: nothing is known
+    but what a record may hold."""
 
-    clock_drift_sigma: float = 1e-4
-    """Standard deviation of the clock drift at the start, s/s: ten times a bare crystal's."""
+    clock_drift_sigma: float = 1e-3
+    """Standard deviation of the clock drift at the start, s/s: a hundred times a bare crystal's."""
 
     clock_walk: float = 1e-7
     """Random walk of the clock offset beyond its drift, s per sqrt(s)."""
@@ -99,8 +100,9 @@ class Options:
     """Standard deviation of each component of the DVL's bias, m/s; 0 leaves the state out."""
 
     dvl_misalignment_sigma_deg: float = 0.5
-    """Standard deviation of each angle between DVL and attitude reference, degrees; the
-    attitude's own sigma is added in square. 0 leaves the state out."""
+    """Standard deviation of each angle between DVL and attitude reference, degrees; 0 leaves the
+    state out. Lasting errors of roll and pitch add to it by the attitude records' sigma; that of
+    the heading is a state of its own, `heading_bias`, with that sigma."""
 
     start_window: float = 80.0
     """Length of the windows in which a start is searched, s."""

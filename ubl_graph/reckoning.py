@@ -21,6 +21,16 @@ class DeadReckoning:
         self.depth = None if depth is None or not len(depth) else depth[np.argsort(depth.t)]
         self.sightings = self._sightings()
 
+    def covers(self, begin: float, end: float) -> bool:
+        """Whether odometry knows the way from `begin` to `end`, but for a twentieth of it."""
+        if self.odometry is None:
+            return False
+        return self.odometry.missing(begin, end) <= 0.05 * (end - begin) + 1e-6
+
+    def breaks(self) -> FloatArray:
+        """Times at which odometry begins or ends, s; no window may span one."""
+        return np.empty(0) if self.odometry is None else self.odometry.breaks()
+
     def offset(self, t: FloatArray) -> FloatArray:
         """Displacement since the first node (and the up where depth is known), (M, 3), m."""
         if not len(t):

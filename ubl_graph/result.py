@@ -156,7 +156,8 @@ class Result:
     beacons : dict of str to Shared
         Every beacon; covariance zero where beacons are constants.
     shared : dict of str to Shared
-        DVL errors: `dvl_scale`, `dvl_misalignment` (rad), `dvl_bias` (m/s).
+        `dvl_scale`, `dvl_misalignment` (rad), `dvl_bias` (m/s), `heading_bias` (rad, what the
+        heading reference reads too far clockwise).
     warnings : tuple of str
         What a user should know before trusting it.
     wall_times : dict of str to float

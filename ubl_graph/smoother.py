@@ -19,15 +19,17 @@ from ubl_graph.graph import SegmentModel, build_problem, model_segment
 from ubl_graph.initial import START_LIMIT, Starts, find_starts
 from ubl_graph.mission import Mission
 from ubl_graph.problem import Problem
-from ubl_graph.result import Result, SegmentResult, Shared
-from ubl_graph.solve.lm import Solution, solve
+from ubl_graph.result import DOWN_WEIGHTED, Result, SegmentResult, Shared
+from ubl_graph.solve.lm import Solution, graduated, solve
 from ubl_graph.solve.marginals import Marginals
-from ubl_graph.track import Track, mirror_images, place, track_of
+from ubl_graph.track import Track, mirror_images, place, track_of, unanchored
 
 #: A second track counts as no worse where its cost is higher by less than this: odds of 20 to 1.
 AMBIGUOUS_COST = 3.0
 #: A second track nearer than so many standard deviations is the same flat valley, not a rival.
 COVERED_SIGMAS = 3.0
+#: Where more pings than this are down-weighted, a graduated solve is tried as well.
+DOUBTFUL_SHARE = 0.01
 #: Outliers are a few per cent; where a fifth of the pings disagree, something else is wrong.
 SUSPICIOUS_SHARE = 0.2
 #: Sigmas would have to be twice too small to explain this.
@@ -126,6 +128,8 @@ def _smooth_group(
     with work.stage("covariance"):
         marginals = Marginals(problem, solution)
         rival = _rival(problem, solution, marginals, rivals)
+        if len(group) == 1:
+            rival = unanchored(group[0]) or rival
         results = [
             assemble_segment(problem, solution, marginals, chain, model, rival, number)
             for chain, model in zip(problem.layout.chains, group, strict=True)
@@ -154,13 +158,27 @@ def _solve_from(
 
     Returns the cheapest solution, and the others.
     """
-    solutions = [work.solve(problem, _vector(problem, [s.tracks[0] for s in starts]))]
+    begin = _vector(problem, [s.tracks[0] for s in starts])
+    solutions = [work.solve(problem, begin)]
+    if _down_weighted(problem, solutions[0]) > DOUBTFUL_SHARE:
+        solutions.append(work.solve(problem, graduated(problem, begin)))
+        solutions.sort(key=lambda s: s.cost)
     if len(group) == 1:
         found = track_of(problem.layout, problem.layout.chains[0], solutions[0].x)
         rivals = [*starts[0].tracks[1:], *mirror_images(work.mission, group[0], found)]
         solutions += [work.solve(problem, _vector(problem, [track])) for track in rivals]
     best, *others = sorted(solutions, key=lambda s: s.cost)
     return best, others
+
+
+def _down_weighted(problem: Problem, solution: Solution) -> float:
+    """Share of the robust rows that count for less than half."""
+    weights = [
+        problem.loss.weights(block.evaluate(solution.x, held, jacobian=False)[0])[:, 0]
+        for block, held in zip(problem.blocks, solution.frozen, strict=True)
+        if block.robust
+    ]
+    return float((np.concatenate(weights) < DOWN_WEIGHTED).mean()) if weights else 0.0
 
 
 def _rival(

@@ -86,16 +86,49 @@ def mirror_images(mission: Mission, model: SegmentModel, track: Track) -> list[T
     list of Track
         Empty with odometry, with a second beacon, or without any.
     """
-    segment = model.segment
-    ranges = [r for r in (segment.two_way_range, segment.one_way_range) if r is not None]
-    heard = {str(name) for r in ranges for name in r.beacon}
-    if len(heard) != 1 or model.bottom is not None or model.water is not None:
+    segment, name = model.segment, _lone_beacon(model)
+    if name is None:
         return []
-    beacon = next(b for b in mission.beacons if b.name in heard).position[:2]
+    beacon = next(b for b in mission.beacons if b.name == name).position[:2]
     axes = [track.position[-1, :2] - track.position[0, :2]]
     if segment.start is not None:
         axes.append(np.array([segment.start.east, segment.start.north]) - beacon)
     return [_reflected(track, beacon, axis) for axis in axes if np.linalg.norm(axis) > 1.0]
+
+
+def unanchored(model: SegmentModel) -> str | None:
+    """Why a segment's track cannot be unique, whatever its covariance says; None where it can.
+
+    Ranges to one beacon stay the same when the whole track is turned about it or mirrored. Without
+    odometry, which knows the heading, one known point still leaves the mirror image; two do not.
+    """
+    segment = model.segment
+    if _lone_beacon(model) is None:
+        return None
+    anchors = (segment.start is not None) + (
+        0 if segment.position is None else len(segment.position)
+    )
+    if anchors >= 2:
+        return None
+    how = (
+        "be mirrored in the line through the beacon and the known point"
+        if anchors
+        else ("be turned about the beacon")
+    )
+    return (
+        f"ambiguous: one beacon was heard and there is no odometry, so the whole track can {how} "
+        "without changing a range; velocities and heading, a second beacon or two fixes would tell"
+    )
+
+
+def _lone_beacon(model: SegmentModel) -> str | None:
+    """Name of the only beacon heard where there is no odometry, else None."""
+    segment = model.segment
+    ranges = [r for r in (segment.two_way_range, segment.one_way_range) if r is not None]
+    heard = {str(name) for r in ranges for name in r.beacon}
+    if len(heard) != 1 or model.bottom is not None or model.water is not None:
+        return None
+    return heard.pop()
 
 
 def _reflected(track: Track, point: FloatArray, axis: FloatArray) -> Track:

@@ -28,6 +28,8 @@ PARAMETERS = 11
 #: Directions around a beacon in which starts are laid on its range circle.
 AZIMUTHS = 16
 ITERATIONS = 40
+#: A one-way range longer than this may be mostly clock offset, s.
+LONG_FLIGHT = 3.0
 #: Hypotheses kept for a window in any case,
 KEPT = 6
 #: and more of them where so little tells them apart (one beacon and no heading: a whole circle).
@@ -159,22 +161,40 @@ def _starts(profile: SoundSpeedProfile, s: Sightings, prior: Prior) -> FloatArra
     starts: list[FloatArray] = []
     for row in np.unique(np.linspace(0, len(s.t) - 1, 3).astype(int)) if len(s.t) else []:
         speed = float(profile.harmonic_mean(-s.offset[row, 0, 2], -s.beacon[row, 2]))
-        flight = abs(s.measured[row] - s.clock[row] * prior.mean[CLOCK]) / s.share[row].sum()
-        radius = flight * speed
         for up in _start_levels(s, row, prior):
             drop = s.offset[row, 0, 2] + up - s.beacon[row, 2]
-            reach = np.sqrt(max(radius**2 - drop**2, (0.05 * radius) ** 2))
-            angle = 2.0 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS
-            theta = np.tile(prior.mean, (AZIMUTHS, 1))
-            theta[:, 0] = s.beacon[row, 0] - s.offset[row, 0, 0] + reach * np.sin(angle)
-            theta[:, 1] = s.beacon[row, 1] - s.offset[row, 0, 1] + reach * np.cos(angle)
-            theta[:, 2] = up
-            starts.append(theta)
+            for flight, clock in _start_flights(s, row, prior, abs(drop) / speed):
+                reach = np.sqrt(max((flight * speed) ** 2 - drop**2, (0.05 * flight * speed) ** 2))
+                angle = 2.0 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS
+                theta = np.tile(prior.mean, (AZIMUTHS, 1))
+                theta[:, 0] = s.beacon[row, 0] - s.offset[row, 0, 0] + reach * np.sin(angle)
+                theta[:, 1] = s.beacon[row, 1] - s.offset[row, 0, 1] + reach * np.cos(angle)
+                theta[:, 2] = up
+                theta[:, CLOCK] = clock
+                starts.append(theta)
     if len(s.fix_t):
         theta = prior.mean.copy()
         theta[:2] = np.mean((s.fix - s.fix_offset)[:, :2], axis=0)
         starts.append(theta[None])
     return np.concatenate(starts)
+
+
+def _start_flights(
+    s: Sightings, row: int, prior: Prior, straight_up: float
+) -> list[tuple[float, float]]:
+    """Times of flight to start at, each with its clock offset, s.
+
+    A one-way range holds the clock offset too. Where it is longer than sound takes over 4.5 km, the
+    offset may be most of it: then flights of one and a half and of three times the way straight up
+    are tried as well.
+    """
+    measured = float(s.measured[row])
+    if not s.clock[row]:
+        return [(measured / s.share[row].sum(), float(prior.mean[CLOCK]))]
+    flights = [(abs(measured - prior.mean[CLOCK]), float(prior.mean[CLOCK]))]
+    if abs(measured) > LONG_FLIGHT or measured < 0.0:
+        flights += [(f, measured - f) for f in (1.5 * straight_up + 0.1, 3.0 * straight_up + 0.3)]
+    return flights
 
 
 def _start_levels(s: Sightings, row: int, prior: Prior) -> list[float]:

@@ -7,8 +7,9 @@ integral. Errors of the DVL enter linearly (first order in the angles): with mea
     v_true = (1 + scale) v + misalignment x v + bias
 
 in forward-left-up axes, so that the same running integral, taken of R v, of R [-v]x and of R,
-holds the displacement and its derivatives. A lever arm r of the DVL adds (R1 - R0) r, and the
-current, for velocities relative to the water, its mean times dt.
+holds the displacement and its derivatives. What the heading reference reads too much turns the way
+about the vertical instead: the two differ as soon as the vehicle rolls or pitches. A lever arm r of
+the DVL adds (R1 - R0) r, and the current, for velocities relative to the water, its mean times dt.
 """
 
 from __future__ import annotations
@@ -29,8 +30,9 @@ GAP_FACTOR = 5.0
 #: but never one shorter than this, s.
 MIN_GAP = 1.0
 
-#: The shared states of a DVL, with their sizes, in the order of `Preintegration` components.
-DVL_STATES = (("dvl_scale", 1), ("dvl_misalignment", 3), ("dvl_bias", 3))
+#: The shared states of odometry with their sizes: the DVL's errors, and what the heading
+#: reference reads too much.
+DVL_STATES = (("dvl_scale", 1), ("dvl_misalignment", 3), ("dvl_bias", 3), ("heading_bias", 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +103,13 @@ class Preintegration:
         """Sample times at which coverage starts or ends, s: nodes should stand there."""
         closed = np.flatnonzero(~self._open)
         return self.t[np.concatenate([[0], closed, closed + 1, [len(self.t) - 1]])]
+
+    def missing(self, t0: float, t1: float) -> float:
+        """Seconds of the interval from `t0` to `t1` that no samples cover."""
+        times = np.array([t0, t1])
+        outside = np.maximum(self.t[0] - times, 0.0) - np.maximum(times - self.t[-1], 0.0)
+        gaps = self._integrals_at(np.clip(times, self.t[0], self.t[-1]))[2]
+        return float(outside[0] - outside[1] + gaps[1] - gaps[0])
 
     def between(self, t0: FloatArray, t1: FloatArray) -> Displacements:
         """Displacements of the DVL from `t0` to `t1`, (M,) each, s."""
@@ -245,7 +254,10 @@ def node_velocity(
 
 def _error_slopes(d: Displacements, rows: IntArray) -> list[tuple[str, FloatArray]]:
     """Derivatives of displacement or rate by each DVL state, (M, 3, size)."""
-    slopes = (d.displacement[rows][:, :, None], d.by_misalignment[rows], d.by_bias[rows])
+    way = d.displacement[rows]
+    # Read too far clockwise, the way must be turned back, counter-clockwise about up.
+    by_heading = np.stack([-way[:, 1], way[:, 0], np.zeros(len(way))], axis=1)
+    slopes = (way[:, :, None], d.by_misalignment[rows], d.by_bias[rows], by_heading[:, :, None])
     return [(name, slope) for (name, _), slope in zip(DVL_STATES, slopes, strict=True)]
 
 

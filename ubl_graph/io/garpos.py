@@ -22,7 +22,7 @@ from ubl_graph.errors import ConfigurationError, DataError
 from ubl_graph.frames import GeodeticOrigin, LeverArm, world_R_body
 from ubl_graph.io.records import degrees
 from ubl_graph.io.tables import Table, did_you_mean, naming, read_table, read_text, shortened
-from ubl_graph.measurements import TRAVEL_TIME_SIGMA, Depth, TwoWayRange
+from ubl_graph.measurements import MAX_DISTANCE, TRAVEL_TIME_SIGMA, Depth, TwoWayRange
 from ubl_graph.mission import Reference, Segment
 
 #: Standard deviation of the transducer's depth, m: kinematic GNSS heave.
@@ -222,6 +222,8 @@ def read_beacons(file: str | Path) -> dict[str, Beacon]:
         document = json.loads(text)
     except json.JSONDecodeError as error:
         raise DataError(f"no JSON: {error.msg}", file=file, line=error.lineno) from error
+    except RecursionError as error:
+        raise DataError("no beacons file: nested too deeply", file=file) from error
     stations = document.get("beacons") if isinstance(document, dict) else None
     if not isinstance(stations, dict) or not stations:
         raise DataError(
@@ -304,6 +306,12 @@ def _segment(name: str, table: Table, arm: FloatArray, sigma: float) -> Segment:
 def _transducer(table: Table, columns: Sequence[str], arm: FloatArray) -> FloatArray:
     """Transducer positions, east, north, up, m, shape (M, 3): antenna + R lever arm."""
     antenna = np.stack([table.finite(name) for name in columns[:3]], axis=1)
+    far = np.argwhere(np.abs(antenna) > MAX_DISTANCE)
+    if len(far):
+        row, column = far[0]
+        raise table.source.error(
+            int(row), columns[int(column)], f"{antenna[row, column]:g} m is no local coordinate"
+        )
     angles = [np.deg2rad(degrees(table, name, -720.0, 720.0)) for name in columns[3:]]
     return antenna + world_R_body(*angles) @ arm
 

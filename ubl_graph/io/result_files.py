@@ -100,7 +100,7 @@ def check_folder(folder: str | Path) -> None:
         Where `folder` exists and is no folder.
     """
     folder = Path(folder)
-    if folder.exists() and not folder.is_dir():
+    if (folder.exists() or folder.is_symlink()) and not folder.is_dir():
         raise DataError("the output is a file, not a folder", "name a folder", file=folder)
 
 
@@ -283,11 +283,25 @@ def _staged(folder: Path) -> Generator[Path]:
         ) from error
     try:
         yield stage
+        _move_in(stage, folder)
+    finally:
+        shutil.rmtree(stage, ignore_errors=True)
+
+
+def _move_in(stage: Path, folder: Path) -> None:
+    """Let the staged files take their places: all of them, or none where one cannot."""
+    blocked = [path.name for path in stage.iterdir() if (folder / path.name).is_dir()]
+    if blocked:
+        raise DataError(
+            f"'{blocked[0]}' in the output folder is a folder", "move it away", file=folder
+        )
+    try:
         if folder.exists():
             for path in stage.iterdir():
                 path.replace(folder / path.name)
         else:
             stage.chmod(0o755)
             stage.replace(folder)
-    finally:
-        shutil.rmtree(stage, ignore_errors=True)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise DataError(f"the output cannot be written ({reason})", file=folder) from error
