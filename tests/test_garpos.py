@@ -302,10 +302,10 @@ def test_wrong_data_of_garpos_missions(campaign, tmp_path):
     failure(load_mission, slow, file="mission.toml", field="data.sound_speed", words="1.5 m/s")
     campaign([row(), row(1, mt="M9", st=5, rt=7.5)])
     file = mission_file(tmp_path, DATA)
-    place = {"file": "obs.csv", "row": 2, "line": 4, "field": "beacon"}
+    place = {"file": "obs.csv", "row": 2, "line": 4, "field": "MT"}
     failure(load_mission, file, **place, words="unknown beacon 'M9'")
     campaign([row(), row(1, st=5, rt=7.5), row(2)])
-    place = {"file": "obs.csv", "row": 3, "line": 5, "field": "t_receive"}
+    place = {"file": "obs.csv", "row": 3, "line": 5, "field": "RT"}
     failure(load_mission, file, **place, words="duplicate record")
 
 

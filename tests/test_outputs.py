@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from ubl_graph import Options, smooth
+from ubl_graph import Options, SoundSpeedProfile, smooth
 from ubl_graph.errors import ConfigurationError, DataError, TimeError
 from ubl_graph.evaluation import Errors, errors_of, evaluate
 from ubl_graph.io import result_files
@@ -185,3 +185,13 @@ def test_what_should_stop_a_user_is_a_warning(result):
         options = replace(result.mission.options, loss=loss)
         found = smooth(replace(result.mission, segments=(spoilt,), options=options))
         assert any(said in w for w in found.warnings), (loss, found.warnings)
+
+
+def test_a_profile_that_ends_far_above_the_beacons_is_said(result):
+    mission = result.mission
+    deepest = max(-b.position[2] for b in mission.beacons)
+    short = SoundSpeedProfile([0.0, 0.5 * deepest], [1500.0, 1499.0])
+    one = replace(mission, sound_speed=short, segments=mission.segments[:1])
+    assert any("profile ends at" in w for w in smooth(one).warnings)
+    long = SoundSpeedProfile([0.0, 0.95 * deepest], [1500.0, 1499.0])
+    assert not any("profile" in w for w in smooth(replace(one, sound_speed=long)).warnings)

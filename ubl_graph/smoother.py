@@ -30,6 +30,8 @@ AMBIGUOUS_COST = 3.0
 COVERED_SIGMAS = 3.0
 #: Where more pings than this are down-weighted, a graduated solve is tried as well.
 DOUBTFUL_SHARE = 0.01
+#: A profile may end so much above the deepest beacon, as a share of its depth.
+PROFILE_SLACK = 0.1
 #: Outliers are a few per cent; where a fifth of the pings disagree, something else is wrong.
 SUSPICIOUS_SHARE = 0.2
 #: Sigmas would have to be twice too small to explain this.
@@ -70,6 +72,7 @@ def smooth(mission: Mission, progress: Progress | None = None) -> Result:
     'converged'
     """
     work = _Work(mission, progress)
+    _judge_profile(work)
     with work.stage("model"):
         models = [model_segment(segment, mission.options) for segment in mission.segments]
     shared_unknowns = mission.options.estimate_beacons or any(m.bottom or m.water for m in models)
@@ -86,6 +89,19 @@ def smooth(mission: Mission, progress: Progress | None = None) -> Result:
     beacons = beacons_of(mission, shared)
     shared = {name: s for name, s in shared.items() if not name.startswith("beacon ")}
     return Result(mission, tuple(segments), beacons, shared, tuple(work.warnings), work.wall_times)
+
+
+def _judge_profile(work: _Work) -> None:
+    """Warn where the sound-speed profile ends well above the deepest beacon."""
+    profile = work.mission.sound_speed
+    deepest = max((-float(b.position[2]) for b in work.mission.beacons), default=0.0)
+    last = float(profile.depth[-1])
+    if not profile.is_constant and deepest > last + PROFILE_SLACK * deepest:
+        work.warn(
+            "",
+            f"the sound-speed profile ends at {last:g} m, the deepest beacon is at {deepest:g} m; "
+            "the last gradient was continued",
+        )
 
 
 def _judge(work: _Work, segment: SegmentResult) -> None:

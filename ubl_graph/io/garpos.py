@@ -36,7 +36,8 @@ _POSES = tuple(
     for end in "01"
 )
 _COLUMNS = ("SET", "LN", "MT", "TT", "flag", *_TIMES, *_POSES[0], *_POSES[1])
-_IN_FILE = {"beacon": "MT", "travel_time": "TT", "t_transmit": "ST", "t_receive": "RT"}
+#: Columns of the observation file by the names that records use.
+IN_FILE = {"beacon": "MT", "travel_time": "TT", "t_transmit": "ST", "t_receive": "RT"}
 _FLAGS = {"true": True, "1": True, "false": False, "0": False}
 
 
@@ -289,7 +290,7 @@ def _flags(table: Table) -> BoolArray:
 
 def _segment(name: str, table: Table, arm: FloatArray, sigma: float) -> Segment:
     sent, heard = (table.finite(column) for column in _TIMES)
-    with naming(table.file, columns=_IN_FILE):
+    with naming(table.file, columns=IN_FILE):
         ranges = TwoWayRange(
             table.text("MT"), sent, heard, table.finite("TT"), sigma, source=table.source
         )

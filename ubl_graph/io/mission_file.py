@@ -18,7 +18,7 @@ from ubl_graph.beacon import Beacon
 from ubl_graph.errors import ConfigurationError
 from ubl_graph.frames import GeodeticOrigin, LeverArm
 from ubl_graph.io import records
-from ubl_graph.io.garpos import GARPOS_OPTIONS, read_garpos
+from ubl_graph.io.garpos import GARPOS_OPTIONS, IN_FILE, read_garpos
 from ubl_graph.io.mission_schema import (
     BeaconTable,
     CsvDataTable,
@@ -96,7 +96,7 @@ def _garpos_mission(document: GarposDocument, path: Path) -> Mission:
     else:
         with naming(path, "data.", columns={"speed": "sound_speed"}):
             profile = SoundSpeedProfile.constant(data.sound_speed)
-    with naming(path):
+    with naming(path, columns=IN_FILE):
         return Mission(
             segments=campaign.segments,
             beacons=campaign.beacons,
