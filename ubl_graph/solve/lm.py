@@ -93,9 +93,7 @@ def solve(
     frozen = problem.frozen(x)
     used, cost = 0, np.inf
     for _ in range(FREEZE_ROUNDS):
-        x, cost, iterations, trouble = _guarded_round(
-            view, x, frozen, max_iterations, used, progress
-        )
+        x, cost, iterations, trouble = _round(view, x, frozen, max_iterations, used, progress)
         used += iterations
         anew = problem.frozen(x)
         if trouble or _change(frozen, anew) < FREEZE_TOLERANCE:
@@ -132,24 +130,8 @@ def graduated(problem: Problem, x: FloatArray) -> FloatArray:
     view = GraphView(problem)
     for width in GRADUATION:
         wide = tuple(None if held is None else width * held for held in problem.frozen(x))
-        x, *_ = _guarded_round(view, x, wide, GRADUATION_ITERATIONS, 0, None)
+        x, *_ = _round(view, x, wide, GRADUATION_ITERATIONS, 0, None)
     return x
-
-
-def _guarded_round(
-    view: GraphView,
-    x: FloatArray,
-    frozen: Frozen,
-    most: int,
-    before: int,
-    progress: Progress | None,
-) -> tuple[FloatArray, float, int, str]:
-    """Run a round; what GTSAM throws becomes a SolverError."""
-    try:
-        return _round(view, x, frozen, most, before, progress)
-    except RuntimeError as error:
-        text = " ".join(str(error).split())[:200]
-        raise SolverError(f"GTSAM gave up: {text}") from error
 
 
 def _round(
@@ -161,14 +143,29 @@ def _round(
     progress: Progress | None,
 ) -> tuple[FloatArray, float, int, str]:
     """One run of the optimiser: estimate, cost, iterations, and what went wrong."""
-    graph = view.graph(frozen)
-    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, view.values(x), _parameters(view))
+    try:
+        graph = view.graph(frozen)
+        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, view.values(x), _parameters(view))
+        cost, done, trouble = _iterate(optimizer, most, before, progress)
+        answer = view.vector(optimizer.values())
+    except RuntimeError as error:
+        text = " ".join(str(error).split())[:200]
+        raise SolverError(f"GTSAM gave up: {text}") from error
+    if not np.isfinite(answer).all():
+        raise SolverError("Levenberg-Marquardt ended in values that are not finite")
+    return answer, cost, done, trouble
+
+
+def _iterate(
+    optimizer: gtsam.LevenbergMarquardtOptimizer,
+    most: int,
+    before: int,
+    progress: Progress | None,
+) -> tuple[float, int, str]:
+    """Iterate until the cost comes to rest: cost, iterations, and what went wrong."""
     cost = optimizer.error()
-    trouble = f"the cost did not come to rest in {most} iterations (max_iterations)"
-    done = 0
-    while done < most:
+    for done in range(1, most + 1):
         optimizer.iterate()
-        done += 1
         previous, cost = cost, optimizer.error()
         if not np.isfinite(cost):
             raise SolverError("Levenberg-Marquardt met a cost that is not finite")
@@ -176,12 +173,8 @@ def _round(
             progress(before + done, cost)
         if previous - cost <= ABSOLUTE_DECREASE + RELATIVE_DECREASE * cost:
             exhausted = optimizer.lambda_() >= LARGEST_LAMBDA
-            trouble = "no step lowers the cost, however damped" if exhausted else ""
-            break
-    answer = view.vector(optimizer.values())
-    if not np.isfinite(answer).all():
-        raise SolverError("Levenberg-Marquardt ended in values that are not finite")
-    return answer, cost, done, trouble
+            return cost, done, "no step lowers the cost, however damped" if exhausted else ""
+    return cost, most, f"the cost did not come to rest in {most} iterations (max_iterations)"
 
 
 def _parameters(view: GraphView) -> gtsam.LevenbergMarquardtParams:
