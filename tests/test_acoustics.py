@@ -294,7 +294,11 @@ def test_direct_ray_matches_an_independent_search_and_quadrature():
         steepest = math.sin(math.atan(50.0)) / fastest
         if textbook(OCEAN, steepest, lo, hi)[0] < x:
             continue
-        p = brentq(lambda p: textbook(OCEAN, p, lo, hi)[0] - x, 0.0, steepest, xtol=1e-18)  # noqa: B023
+
+        def beyond(p, lo=lo, hi=hi, x=x):
+            return textbook(OCEAN, p, lo, hi)[0] - x
+
+        p = brentq(beyond, 0.0, steepest, xtol=1e-18)
         assert ray.found[k]
         assert ray.time[k] == pytest.approx(textbook(OCEAN, p, lo, hi)[1], rel=1e-10)
         assert np.hypot(*ray.gradient_b[k, :2]) == pytest.approx(p, rel=1e-8)
@@ -526,7 +530,7 @@ def test_good_rows_are_untouched_by_shadowed_and_broken_rows():
 
 def test_unknown_mode_for_missing_rays_is_refused():
     with pytest.raises(ConfigurationError, match="'raise' or 'straight'"):
-        eigenray(OCEAN, [0, 0, -1.0], [1, 0, -1.0], missing="nan")  # type: ignore[arg-type]
+        eigenray(OCEAN, [0, 0, -1.0], [1, 0, -1.0], missing="nan")
 
 
 def test_no_ray_turns_above_the_sea_surface_of_a_profile_that_starts_above_it():

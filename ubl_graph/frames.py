@@ -21,7 +21,7 @@ ENU_R_NED: FloatArray = frozen([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.
 FLU_R_FRD: FloatArray = frozen(np.diag([1.0, -1.0, -1.0]))
 
 
-def world_R_body(heading: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> FloatArray:  # noqa: N802
+def world_R_body(heading: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> FloatArray:  # noqa: N802 - the frames' names
     """Rotation matrices from forward-left-up body axes to east-north-up.
 
     Parameters

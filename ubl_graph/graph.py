@@ -302,11 +302,10 @@ class _Builder:
         lever = model.attitude.lever(self.mission.vehicle.transducer, legs_at)
         position = self.layout.positions_at(chain, legs_at)
         legs = Legs(position, lever.reshape(*times.shape, 3), self.psd, self._variance(position))
-        names = list(self.mission.beacon_names)
-        which = np.array([names.index(str(b)) for b in pings.beacon])
+        which = self.mission.beacon_numbers(pings.beacon)
         beacon_columns = None
         if self.options.estimate_beacons:
-            each = [self.layout.shared_columns(f"beacon {n}") for n in names]
+            each = [self.layout.shared_columns(f"beacon {n}") for n in self.mission.beacon_names]
             beacon_columns = np.stack(each)[which]
         sound_speed = clock = None
         if self.layout.has("sound_speed"):

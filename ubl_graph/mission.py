@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ubl_graph.acoustics import SoundSpeedProfile
-from ubl_graph.arrays import FloatArray, frozen
+from ubl_graph.arrays import FloatArray, IntArray, frozen
 from ubl_graph.beacon import Beacon
 from ubl_graph.errors import ConfigurationError, DataError
 from ubl_graph.frames import GeodeticOrigin, LeverArm
@@ -187,6 +187,11 @@ class Mission:
     def beacon_names(self) -> tuple[str, ...]:
         """Names of the beacons, in order."""
         return tuple(b.name for b in self.beacons)
+
+    def beacon_numbers(self, names: FloatArray) -> IntArray:
+        """Number in `beacons` of each name, shape (M,); the names are known to be there."""
+        number = {name: i for i, name in enumerate(self.beacon_names)}
+        return np.array([number[str(name)] for name in names], dtype=np.int64)
 
     @property
     def uses_eigenrays(self) -> bool:

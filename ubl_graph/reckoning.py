@@ -46,16 +46,15 @@ class DeadReckoning:
         return moved
 
     def _sightings(self) -> Sightings:
-        segment, names = self.model.segment, list(self.mission.beacon_names)
+        segment = self.model.segment
+        sites = np.array([b.position for b in self.mission.beacons]).reshape(-1, 3)
         parts: list[list[FloatArray]] = []
         for pings, one_way in ((segment.two_way_range, False), (segment.one_way_range, True)):
             if pings is None or not len(pings):
                 continue
             first = pings.t_receive if one_way else pings.t_transmit
             share = np.array([1.0, 0.0 if one_way else 1.0])
-            beacon = np.array(
-                [self.mission.beacons[names.index(str(b))].position for b in pings.beacon]
-            )
+            beacon = sites[self.mission.beacon_numbers(pings.beacon)]
             m = len(pings)
             parts.append(
                 [

@@ -174,15 +174,18 @@ def _solve_from(
 
     Returns the cheapest solution, and the others.
     """
-    begin = _vector(problem, [s.tracks[0] for s in starts])
+    begin = _vector(work.mission, problem, [s.tracks[0] for s in starts])
     solutions = [work.solve(problem, begin)]
     if _down_weighted(problem, solutions[0]) > DOUBTFUL_SHARE:
         solutions.append(work.solve(problem, graduated(problem, begin)))
         solutions.sort(key=lambda s: s.cost)
     if len(group) == 1:
-        found = track_of(problem.layout, problem.layout.chains[0], solutions[0].x)
-        rivals = [*starts[0].tracks[1:], *mirror_images(work.mission, group[0], found)]
-        solutions += [work.solve(problem, _vector(problem, [track])) for track in rivals]
+        rivals = list(starts[0].tracks[1:])
+        if unanchored(group[0]) is None:
+            found = track_of(problem.layout, problem.layout.chains[0], solutions[0].x)
+            rivals += mirror_images(work.mission, group[0], found)
+        starts_at = [_vector(work.mission, problem, [track]) for track in rivals]
+        solutions += [work.solve(problem, x) for x in starts_at]
     best, *others = sorted(solutions, key=lambda s: s.cost)
     return best, others
 
@@ -216,16 +219,14 @@ def _rival(
     return None
 
 
-def _vector(problem: Problem, tracks: Sequence[Track]) -> FloatArray:
+def _vector(mission: Mission, problem: Problem, tracks: Sequence[Track]) -> FloatArray:
     """The flat vector that a solver starts at: the tracks, beacons where they are, else zero."""
     x = np.zeros(problem.layout.size)
     for chain, track in zip(problem.layout.chains, tracks, strict=True):
         place(problem.layout, chain, track, x)
-    for block in problem.blocks:
-        if block.name == "beacon prior":
-            matrix = block.evaluate(x)
-            assert matrix[1] is not None
-            x[block.columns[0]] = -matrix[0][0] / np.diag(matrix[1][0])
+    for beacon in mission.beacons:
+        if problem.layout.has(f"beacon {beacon.name}"):
+            problem.layout.put(x, f"beacon {beacon.name}", beacon.position)
     return x
 
 

@@ -70,9 +70,9 @@ def track_of(layout: Layout, chain: Chain, x: FloatArray) -> Track:
 def mirror_images(mission: Mission, model: SegmentModel, track: Track) -> list[Track]:
     """Tracks that the ranges to a single beacon cannot tell from this one.
 
-    Without odometry they fit as well when reflected in a vertical plane through the beacon: along
-    the mean course, or through the start where a prior holds that. Windows find such images too,
-    but on a valley of answers only by luck.
+    Without odometry they fit as well, but for what is known of points, when reflected in a vertical
+    plane through the beacon: along the mean course, or through the start where a prior holds that.
+    Windows find such images too, but on a valley of answers only by luck.
 
     Parameters
     ----------
@@ -105,16 +105,13 @@ def unanchored(model: SegmentModel) -> str | None:
     segment = model.segment
     if _lone_beacon(model) is None:
         return None
-    anchors = (segment.start is not None) + (
-        0 if segment.position is None else len(segment.position)
-    )
+    fixes = 0 if segment.position is None else len(segment.position)
+    anchors = fixes + (segment.start is not None)
     if anchors >= 2:
         return None
-    how = (
-        "be mirrored in the line through the beacon and the known point"
-        if anchors
-        else ("be turned about the beacon")
-    )
+    turned = "be turned about the beacon"
+    mirrored = "be mirrored in the line through the beacon and the known point"
+    how = mirrored if anchors else turned
     return (
         f"ambiguous: one beacon was heard and there is no odometry, so the whole track can {how} "
         "without changing a range; velocities and heading, a second beacon or two fixes would tell"

@@ -6,12 +6,10 @@ once and return `TravelTimes`.
 """
 
 from ubl_graph.acoustics.eigenray import eigenray
-from ubl_graph.acoustics.profile import BoolArray, FloatArray, SoundSpeedProfile
+from ubl_graph.acoustics.profile import SoundSpeedProfile
 from ubl_graph.acoustics.straight import TravelTimes, straight
 
 __all__ = [
-    "BoolArray",
-    "FloatArray",
     "SoundSpeedProfile",
     "TravelTimes",
     "eigenray",

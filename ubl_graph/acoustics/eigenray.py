@@ -11,10 +11,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ubl_graph.acoustics.profile import FloatArray, SoundSpeedProfile
-from ubl_graph.acoustics.rays import IntArray, direct_rays, direct_reach, stack
+from ubl_graph.acoustics.profile import SoundSpeedProfile
+from ubl_graph.acoustics.rays import direct_rays, direct_reach, stack
 from ubl_graph.acoustics.straight import TravelTimes, point_pairs, straight
 from ubl_graph.acoustics.turning import SAMPLES, turning_rays, turns_below
+from ubl_graph.arrays import FloatArray, IntArray
 from ubl_graph.errors import ConfigurationError, NoDirectRayError
 
 _CHUNK = 32768  # elements (layers times rows) worked on at once: the arrays stay in the L2 cache

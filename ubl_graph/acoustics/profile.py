@@ -6,12 +6,10 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ubl_graph.arrays import BoolArray, FloatArray
 from ubl_graph.errors import DataError
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 SLOWEST, FASTEST = 1300.0, 1700.0
 """Bounds of a plausible speed of sound in sea water, m/s: the coldest fresh water has 1402, the

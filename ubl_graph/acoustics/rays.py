@@ -22,11 +22,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ubl_graph.acoustics.profile import BoolArray, FloatArray, Nodes, SoundSpeedProfile
-
-IntArray = NDArray[np.intp]
+from ubl_graph.acoustics.profile import Nodes, SoundSpeedProfile
+from ubl_graph.arrays import BoolArray, FloatArray, IntArray
 
 MISS = 1e-9  # horizontal miss at which the search ends, over the distance
 _NEWTON = 5  # plain Newton steps; a ray far from grazing needs two

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ubl_graph.acoustics.profile import BoolArray, FloatArray, SoundSpeedProfile
+from ubl_graph.acoustics.profile import SoundSpeedProfile
+from ubl_graph.arrays import BoolArray, FloatArray
 from ubl_graph.errors import DataError
 
 

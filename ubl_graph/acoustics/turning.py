@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ubl_graph.acoustics.profile import FloatArray, Nodes
-from ubl_graph.acoustics.rays import GRAZING, MISS, IntArray, Rays, layer_times, stack
+from ubl_graph.acoustics.profile import Nodes
+from ubl_graph.acoustics.rays import GRAZING, MISS, Rays, layer_times, stack
+from ubl_graph.arrays import FloatArray, IntArray
 
 _TURNING = 60  # bound on the bracketed steps, of which 8 are usual; random profiles took 41
 SAMPLES = np.linspace(0.0, 1.0, 7)  # where X is looked at while a ray turns within one layer
