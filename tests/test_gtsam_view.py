@@ -19,8 +19,9 @@ from ubl_graph.measurements import Depth, TwoWayRange
 from ubl_graph.mission import Mission, Segment
 from ubl_graph.options import Options
 from ubl_graph.problem import Problem
-from ubl_graph.solve.lm import solve
+from ubl_graph.solve.lm import GtsamEngine
 from ubl_graph.solve.marginals import Marginals
+from ubl_graph.solve.rounds import solve
 
 X, V = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.V
 CASES = [
@@ -185,7 +186,7 @@ def drifting_mission(loss: str = "cauchy") -> tuple[Mission, np.ndarray]:
 def test_a_clock_that_nothing_observes_has_a_covariance_all_the_same():
     """Robust weights of nonsense pings leave the clock to its wide prior and its tight walk."""
     problem = problem_of(everything(4))
-    solution = solve(problem, state_of(problem, 4), max_iterations=3)
+    solution = solve(GtsamEngine(problem), state_of(problem, 4), max_iterations=3)
     marginals = Marginals(problem, solution)
     assert np.isfinite(marginals.of("position")).all()
     assert np.sqrt(marginals.of("clock_offset")).max() > 1e-3
@@ -199,7 +200,7 @@ def test_gtsam_lm_ends_where_the_gradient_of_our_cost_vanishes():
     t = problem.layout.chains[0].t
     truth = np.stack([t - 90.0, 0.3 * t, 0 * t - 10.0], axis=1)
     problem.layout.put(x, "position", truth + rng.normal(size=truth.shape) * [20.0, 20.0, 0.1])
-    solution = solve(problem, x)
+    solution = solve(GtsamEngine(problem), x)
     assert solution.converged
     residual, jacobian = problem.linearize(solution.x, solution.frozen)
     hessian = (jacobian.T @ jacobian).toarray()
@@ -211,7 +212,7 @@ def test_gtsam_lm_ends_where_the_gradient_of_our_cost_vanishes():
 def test_marginals_are_the_inverse_of_the_normal_matrix():
     problem = problem_of(everything(4, loss="none", clock_offset_sigma=1e-3))
     x = state_of(problem, 4)
-    solution = solve(problem, x, max_iterations=3)
+    solution = solve(GtsamEngine(problem), x, max_iterations=3)
     marginals = Marginals(problem, solution)
     _, jacobian = problem.linearize(solution.x, solution.frozen)
     dense = (jacobian.T @ jacobian).toarray()
@@ -238,7 +239,7 @@ def test_marginals_are_gtsams_own_where_it_can_compute_them(motion):
     x = np.zeros(layout.size)
     t = layout.chains[0].t
     layout.put(x, "position", np.stack([t - 90.0, 0.3 * t, 0 * t - 10.0], axis=1))
-    solution = solve(problem, x)
+    solution = solve(GtsamEngine(problem), x)
     ours = Marginals(problem, solution)
     view = GraphView(problem)
     theirs = gtsam.Marginals(view.graph(solution.frozen), view.values(solution.x))

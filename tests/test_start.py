@@ -32,7 +32,8 @@ from ubl_graph.sim import (
     straight_pass,
     two_way_pings,
 )
-from ubl_graph.solve.lm import solve
+from ubl_graph.solve.lm import GtsamEngine
+from ubl_graph.solve.rounds import solve
 
 PROFILE = SoundSpeedProfile.constant(1500.0)
 SPAN = (0.0, 210.0)
@@ -300,4 +301,4 @@ def test_outliers_do_not_choose_the_minimum(seed: int):
     for name in ("position", "velocity"):
         problem.layout.put(x, name, getattr(clean.trajectory, name))
     problem.layout.put(x, "sound_speed", clean.segments[0].slow["sound_speed"].value)
-    assert result.segments[0].cost <= solve(problem, x).cost + 1e-3
+    assert result.segments[0].cost <= solve(GtsamEngine(problem), x).cost + 1e-3

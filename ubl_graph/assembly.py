@@ -7,13 +7,13 @@ import numpy as np
 from ubl_graph.arrays import FloatArray
 from ubl_graph.factors.ranges import RangeBlock
 from ubl_graph.graph import SegmentModel
-from ubl_graph.layout import Chain
+from ubl_graph.layout import KINEMATIC, Chain
 from ubl_graph.mission import Mission
 from ubl_graph.problem import Problem
 from ubl_graph.result import RangeResiduals, SegmentResult, Shared, SlowState, Status
-from ubl_graph.solve.lm import Solution
 from ubl_graph.solve.marginals import Marginals
-from ubl_graph.trajectory import Trajectory
+from ubl_graph.solve.rounds import Solution
+from ubl_graph.trajectory import NodeCovariance, Trajectory
 
 #: Where half of the nodes are known worse than this share of the typical slant range, the
 #: linearised covariance means nothing and the track counts as not observed.
@@ -30,6 +30,7 @@ def assemble_segment(
     model: SegmentModel,
     rival: str | None,
     number: int,
+    solver: str,
 ) -> SegmentResult:
     """Everything that a user reads of one segment.
 
@@ -43,15 +44,23 @@ def assemble_segment(
         What to say of another track that fits as well.
     number : int
         Of the problem among those of the mission.
+    solver : str
+        What solved it.
     """
     layout = problem.layout
+    states = KINEMATIC[: layout.order]
+    following = slice(chain.nodes.start, chain.nodes.stop - 1)
+    joint = NodeCovariance(
+        marginals.joint(states)[chain.nodes], marginals.following(states)[following]
+    )
     trajectory = Trajectory(
         chain.t,
         layout.get(solution.x, "position")[chain.nodes],
         layout.get(solution.x, "velocity")[chain.nodes],
         layout.get(solution.x, "acceleration")[chain.nodes] if layout.order == 3 else None,
-        marginals.of("position")[chain.nodes],
+        np.ascontiguousarray(joint.node[:, :3, :3]),
         problem.psd,
+        joint,
     )
     slow = {name: _slow_state(problem, solution, marginals, chain, name) for name, _ in layout.slow}
     residuals = _range_residuals(problem, solution, chain, model)
@@ -66,6 +75,7 @@ def assemble_segment(
         status,
         reason,
         number,
+        solver,
         solution.cost,
         solution.iterations,
         chi_square,

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Generator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -40,6 +41,10 @@ Output = Annotated[
     Path, typer.Option("-o", "--output", metavar="DIR", help="Folder to write into.")
 ]
 Figures = Annotated[bool, typer.Option(help="Draw figures (PNG).")]
+SolverOption = Annotated[
+    str | None,
+    typer.Option("--solver", metavar="NAME", help="auto, gtsam or banded, whatever the file says."),
+]
 
 
 @app.callback(invoke_without_command=True)
@@ -59,6 +64,7 @@ def smooth(
     mission: Annotated[Path, typer.Argument(metavar="MISSION.toml", help="The mission file.")],
     output: Output,
     figures: Figures = True,
+    solver: SolverOption = None,
 ) -> None:
     """Smooth a mission and write trajectory, residuals, result and figures.
 
@@ -67,7 +73,7 @@ def smooth(
     from ubl_graph.evaluation import Errors, evaluate
     from ubl_graph.io.mission_file import load_mission
 
-    loaded = load_mission(mission)
+    loaded = _solved_by(load_mission(mission), solver)
     _check_output(output)
     result = _smooth(loaded)
     _write(result, output, figures)
@@ -82,6 +88,7 @@ def demo(
     output: Output = Path("ubl-graph-demo"),
     seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated noise.")] = 1,
     figures: Figures = True,
+    solver: SolverOption = None,
 ) -> None:
     """Simulate an AUV survey over one beacon, smooth it, and compare with dead reckoning.
 
@@ -92,7 +99,7 @@ def demo(
     from ubl_graph.sim import demo_survey
 
     _check_output(output)
-    mission, _ = demo_survey(seed)
+    mission = _solved_by(demo_survey(seed)[0], solver)
     result = _smooth(mission)
     reckoned = dead_reckoning(mission)
     _write(result, output, figures, {"dead reckoning": list(reckoned.values())})
@@ -117,6 +124,13 @@ def main() -> None:
     except KeyboardInterrupt:
         typer.echo("ubl-graph: interrupted", err=True)
         sys.exit(130)
+
+
+def _solved_by(mission: Mission, solver: str | None) -> Mission:
+    """The mission with the solver that the command line names."""
+    if solver is None:
+        return mission
+    return replace(mission, options=replace(mission.options, solver=solver))
 
 
 def _smooth(mission: Mission) -> Result:

@@ -230,3 +230,18 @@ class Interpolation:
     weights: FloatArray
     dt: FloatArray
     s: FloatArray
+
+    def compact(self) -> Interpolation:
+        """The same with the states of zero weight left out as far as all rows have some.
+
+        At a node one state is all there is; what a row does not have keeps the pad -1.
+        """
+        unused = self.weights == 0.0
+        width = int(self.weights.shape[1] - unused.sum(axis=1).min(initial=self.weights.shape[1]))
+        if width == self.weights.shape[1]:
+            return self
+        order = np.argsort(unused, axis=1, kind="stable")[:, : max(width, 1)]
+        columns = np.take_along_axis(self.columns, order[:, :, None], axis=1)
+        return Interpolation(
+            columns, np.take_along_axis(self.weights, order, axis=1), self.dt, self.s
+        )

@@ -122,6 +122,8 @@ class SegmentResult:
         What came of it, and why it is not "converged".
     problem : int
         Number of the problem it was solved in: segments that share unknowns are solved together.
+    solver : str
+        What solved that problem: "gtsam", "banded" or "banded, confirmed by gtsam".
     cost : float
         Of that problem.
     iterations : int
@@ -137,6 +139,7 @@ class SegmentResult:
     status: Status
     reason: str
     problem: int
+    solver: str
     cost: float
     iterations: int
     chi_square: float
@@ -257,6 +260,7 @@ class MissionTrajectory:
             np.empty((len(times), 3)),
             np.empty((len(times), 3)),
             np.empty((len(times), 3, 3)),
+            np.empty((len(times), 3, 3)),
         )
         for track, rows in zip(tracks, holds, strict=True):
             if rows.any():
@@ -264,4 +268,5 @@ class MissionTrajectory:
                 out.position[rows] = states.position
                 out.velocity[rows] = states.velocity
                 out.covariance[rows] = states.covariance
+                out.velocity_covariance[rows] = states.velocity_covariance
         return out

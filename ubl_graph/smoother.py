@@ -15,13 +15,15 @@ import numpy as np
 
 from ubl_graph.arrays import FloatArray
 from ubl_graph.assembly import assemble_segment, beacons_of, shared_of
+from ubl_graph.errors import SolverError
 from ubl_graph.graph import SegmentModel, build_problem, model_segment
 from ubl_graph.initial import START_LIMIT, Starts, find_starts
 from ubl_graph.mission import Mission
 from ubl_graph.problem import Problem
 from ubl_graph.result import DOWN_WEIGHTED, Result, SegmentResult, Shared
-from ubl_graph.solve.lm import Solution, graduated, solve
+from ubl_graph.solve.choice import Choice, choose
 from ubl_graph.solve.marginals import Marginals
+from ubl_graph.solve.rounds import Engine, Solution, at_rest, graduated, solve
 from ubl_graph.track import Track, mirror_images, place, track_of, unanchored
 
 #: A second track counts as no worse where its cost is higher by less than this: odds of 20 to 1.
@@ -140,14 +142,18 @@ def _smooth_group(
     group = [model for model, _ in searched]
     with work.stage("solve"):
         problem = build_problem(work.mission, group)
-        solution, rivals = _solve_from(work, problem, group, [s for _, s in searched])
+        choice = choose(problem, work.mission.options.solver)
+        if choice.note:
+            work.warn(group[0].segment.name if len(group) == 1 else "", choice.note)
+        solution, rivals = _solve_from(work, choice.scout, group, [s for _, s in searched])
+        solution, solver = _confirmed(work, choice, solution)
     with work.stage("covariance"):
         marginals = Marginals(problem, solution)
         rival = _rival(problem, solution, marginals, rivals)
         if len(group) == 1:
             rival = unanchored(group[0]) or rival
         results = [
-            assemble_segment(problem, solution, marginals, chain, model, rival, number)
+            assemble_segment(problem, solution, marginals, chain, model, rival, number, solver)
             for chain, model in zip(problem.layout.chains, group, strict=True)
         ]
         return results, shared_of(problem, solution, marginals)
@@ -168,16 +174,17 @@ def _search(work: _Work, model: SegmentModel) -> tuple[SegmentModel, Starts]:
 
 
 def _solve_from(
-    work: _Work, problem: Problem, group: Sequence[SegmentModel], starts: Sequence[Starts]
+    work: _Work, engine: Engine, group: Sequence[SegmentModel], starts: Sequence[Starts]
 ) -> tuple[Solution, list[Solution]]:
     """Solve from the best start, and from its rivals and mirror images in a single segment.
 
     Returns the cheapest solution, and the others.
     """
+    problem = engine.problem
     begin = _vector(work.mission, problem, [s.tracks[0] for s in starts])
-    solutions = [work.solve(problem, begin)]
+    solutions = [work.solve(engine, begin)]
     if _down_weighted(problem, solutions[0]) > DOUBTFUL_SHARE:
-        solutions.append(work.solve(problem, graduated(problem, begin)))
+        solutions.append(work.solve(engine, graduated(engine, begin)))
         solutions.sort(key=lambda s: s.cost)
     if len(group) == 1:
         rivals = list(starts[0].tracks[1:])
@@ -185,9 +192,24 @@ def _solve_from(
             found = track_of(problem.layout, problem.layout.chains[0], solutions[0].x)
             rivals += mirror_images(work.mission, group[0], found)
         starts_at = [_vector(work.mission, problem, [track]) for track in rivals]
-        solutions += [work.solve(problem, x) for x in starts_at]
+        solutions += [work.solve(engine, x) for x in starts_at]
     best, *others = sorted(solutions, key=lambda s: s.cost)
     return best, others
+
+
+def _confirmed(work: _Work, choice: Choice, found: Solution) -> tuple[Solution, str]:
+    """The scout's answer, shown to the other engine; the one that counts, and who gave it."""
+    scout, last = choice.scout, choice.last
+    if last is scout or not found.converged:
+        return found, scout.name
+    try:
+        again = work.solve(last, found.x)
+    except SolverError as error:
+        work.warn("", f"{last.name} could not confirm the answer of {scout.name}: {error}")
+        return found, scout.name
+    if at_rest(found.cost, again.cost):
+        return found, f"{scout.name}, confirmed by {last.name}"
+    return replace(again, iterations=found.iterations + again.iterations), last.name
 
 
 def _down_weighted(problem: Problem, solution: Solution) -> float:
@@ -262,11 +284,11 @@ class _Work:
         if self.progress is not None:
             self.progress(text, self._told)
 
-    def solve(self, problem: Problem, x: FloatArray) -> Solution:
+    def solve(self, engine: Engine, x: FloatArray) -> Solution:
         most = self.mission.options.max_iterations
 
         def each(iteration: int, cost: float) -> None:
             # Nobody knows how many iterations are left; a bar that nears its end serves.
             self.tell(f"iteration {iteration}, cost {cost:.4g}", 1.0 - 0.85**iteration)
 
-        return solve(problem, x, most, each)
+        return solve(engine, x, most, each)

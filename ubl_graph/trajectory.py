@@ -21,6 +21,9 @@ from ubl_graph.errors import TimeError
 
 Order = Literal[2, 3]
 
+#: Times whose covariances are interpolated at once: joint covariances of pairs of nodes are big.
+AT_ONCE = 16384
+
 
 def transition(order: Order, dt: ArrayLike) -> FloatArray:
     """Transition matrix over `dt` (s) of [p, v] or [p, v, a] of one axis, (M, order, order)."""
@@ -116,13 +119,23 @@ def _hermite_basis(order: int) -> FloatArray:
 _HERMITE: dict[int, FloatArray] = {2: _hermite_basis(2), 3: _hermite_basis(3)}
 
 
-def interpolation_variance(order: Order, dt: ArrayLike, s: ArrayLike) -> FloatArray:
-    """Variance of the position between two known nodes at unit noise density, shape (M,).
+def interpolation_variance(
+    order: Order, dt: ArrayLike, s: ArrayLike, derivative: Literal[0, 1] = 0
+) -> FloatArray:
+    """Variance between two known nodes at unit noise density, shape (M,).
 
-    WNOA: dt^3 [s (1-s)]^3 / 3 (dt^3/192 in the middle); WNOJ: dt^5 [s (1-s)]^5 / 20.
+    With u = s (1 - s), of the position dt^3 u^3 / 3 for WNOA (dt^3/192 in the middle) and
+    dt^5 u^5 / 20 for WNOJ; of the velocity dt (u - 3 u^2) and dt^3 (u^3 / 3 - 5 u^4 / 4).
+
+    Parameters
+    ----------
+    order, dt, s, derivative
+        As for `interpolation_weights`.
     """
-    bridge = np.asarray(dt) * np.asarray(s) * (1.0 - np.asarray(s))
-    return bridge**3 / 3.0 if order == 2 else bridge**5 / 20.0
+    dt, u = np.asarray(dt, dtype=np.float64), np.asarray(s) * (1.0 - np.asarray(s))
+    if order == 2:
+        return dt * (u - 3.0 * u**2) if derivative else (dt * u) ** 3 / 3.0
+    return dt**3 * (u**3 / 3.0 - 1.25 * u**4) if derivative else (dt * u) ** 5 / 20.0
 
 
 def longest_interval(order: Order, psd: float, sd: float) -> float:
@@ -145,12 +158,40 @@ class States:
         East, north, up; m and m/s.
     covariance : array, shape (M, 3, 3)
         Of the position, m^2.
+    velocity_covariance : array, shape (M, 3, 3)
+        Of the velocity, (m/s)^2; nan where the trajectory does not know it (dead reckoning).
     """
 
     t: FloatArray
     position: FloatArray
     velocity: FloatArray
     covariance: FloatArray
+    velocity_covariance: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class NodeCovariance:
+    """Joint covariances of the nodes' kinematic states, and of neighbours.
+
+    A state is position, velocity and, where the prior is WNOJ, acceleration: S = 6 or 9; m, s.
+
+    Attributes
+    ----------
+    node : array, shape (N, S, S)
+        Of each node.
+    following : array, shape (N - 1, S, S)
+        Of each node (rows) with the next one (columns).
+    """
+
+    node: FloatArray
+    following: FloatArray
+
+    def pairs(self, k: IntArray) -> FloatArray:
+        """Joint covariance of the nodes k (M,) and k + 1, shape (M, 2 S, 2 S)."""
+        cross = self.following[k]
+        upper = np.concatenate([self.node[k], cross], axis=2)
+        lower = np.concatenate([np.swapaxes(cross, 1, 2), self.node[k + 1]], axis=2)
+        return np.concatenate([upper, lower], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,6 +210,8 @@ class Trajectory:
         Marginal covariance of each node's position, m^2.
     psd : tuple of float
         Horizontal and vertical noise density of the prior.
+    joint : NodeCovariance, optional
+        Covariances of whole states and of neighbours; a smoothed trajectory has them.
     """
 
     t: FloatArray
@@ -177,6 +220,7 @@ class Trajectory:
     acceleration: FloatArray | None
     covariance: FloatArray
     psd: tuple[float, float]
+    joint: NodeCovariance | None = None
 
     @property
     def order(self) -> Order:
@@ -195,8 +239,9 @@ class Trajectory:
         -------
         States
             At a node its own values. Between two nodes the mean is the prior's; the covariance
-            is interpolated linearly between the nodes' and the prior's own variance between
-            known nodes is added.
+            is that of the two nodes together, carried through the interpolation, plus the
+            prior's own between known nodes. Where there is no `joint`, the position's covariance
+            is interpolated linearly instead.
 
         Raises
         ------
@@ -213,14 +258,41 @@ class Trajectory:
         k, dt, s = locate(self.t, times)
         position = self._mean(k, dt, s, 0)
         velocity = self._mean(k, dt, s, 1)
-        k1 = np.minimum(k + 1, len(self.t) - 1)
-        w = s[:, None, None]
-        covariance = (1.0 - w) * self.covariance[k] + w * self.covariance[k1]
+        covariance = [self._spread(k, dt, s, 0), self._spread(k, dt, s, 1)]
+        return States(times, position, velocity, *covariance)
+
+    def _spread(
+        self, k: IntArray, dt: FloatArray, s: FloatArray, derivative: Literal[0, 1]
+    ) -> FloatArray:
+        """Covariance of position or velocity at (k, s): (M, 3, 3)."""
+        out = self._by_nodes(k, dt, s, derivative)
         horizontal, vertical = self.psd
-        extra = interpolation_variance(self.order, dt, s)[:, None]
+        own = interpolation_variance(self.order, dt, s, derivative)
         diagonal = np.arange(3)
-        covariance[:, diagonal, diagonal] += extra * [horizontal, horizontal, vertical]
-        return States(times, position, velocity, covariance)
+        out[:, diagonal, diagonal] += own[:, None] * [horizontal, horizontal, vertical]
+        return out
+
+    def _by_nodes(
+        self, k: IntArray, dt: FloatArray, s: FloatArray, derivative: Literal[0, 1]
+    ) -> FloatArray:
+        """What the nodes' errors make of it."""
+        if self.joint is None:
+            if derivative:
+                return np.full((len(k), 3, 3), np.nan)
+            w, after = s[:, None, None], np.minimum(k + 1, len(self.t) - 1)
+            return (1.0 - w) * self.covariance[k] + w * self.covariance[after]
+        if len(self.t) == 1:
+            own = slice(3 * derivative, 3 * derivative + 3)
+            return self.joint.node[k, own, own]
+        weights = interpolation_weights(self.order, dt, s, derivative)
+        out = np.empty((len(k), 3, 3))
+        for first in range(0, len(k), AT_ONCE):
+            rows = slice(first, first + AT_ONCE)
+            states = 2 * self.order
+            pairs = self.joint.pairs(k[rows]).reshape(-1, states, 3, states, 3)
+            half = np.einsum("mi,miajb->majb", weights[rows], pairs)
+            out[rows] = np.einsum("majb,mj->mab", half, weights[rows])
+        return out
 
     def _mean(
         self, k: IntArray, dt: FloatArray, s: FloatArray, derivative: Literal[0, 1]

@@ -186,6 +186,7 @@ class RangeBlock:
 
 def _by_leg(part: Interpolation, m: int, n_legs: int) -> tuple[IntArray, FloatArray]:
     """Columns (M, L, W, D) and weights (M, L, W). Padding stays -1: its weight is zero."""
+    part = part.compact()
     width = part.weights.shape[1]
     columns = part.columns.reshape(m, n_legs, width, -1)
     return columns, part.weights.reshape(m, n_legs, width)

@@ -5,23 +5,37 @@ clique's factor differ by more than 2^12, which a clock known to a second that w
 does; it is also slower. Here the columns are scaled to unit diagonal first, so that only what is
 singular indeed fails. The tests hold both together where GTSAM can.
 
-With A the nodes' banded part of the normal matrix, A = L L', the blocks of A^-1 within the band
-follow backwards from the last node (Takahashi et al. 1973; Barfoot, State Estimation for
-Robotics, ch. 3.2). What nodes share is a border: Schur's complement adds its part.
+With A = L L' the nodes' part of the normal matrix, the factor says how a node depends on the nodes
+that follow: x_k = G_k y + e_k, with y the nodes in reach, G_k = -(F_k L_kk^-1)' from the rows F_k
+below L_kk, and e_k of covariance (L_kk L_kk')^-1. So covariances run backwards along the chain
+(Takahashi et al. 1973; Barfoot, State Estimation for Robotics, ch. 3.2),
+
+    cov(x_k, y) = G_k P,  cov(x_k) = G_k P G_k' + cov(e_k),  P = cov(y).
+
+A step of this is small, and Python is slow at small steps. Steps are affine in P and can be
+composed: the chain is cut into pieces of equal length, all of them are composed side by side, P is
+carried over the pieces one by one, and all of them are run through side by side. What nodes share
+is a border: Schur's complement adds its part.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
-from scipy import sparse
-from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from ubl_graph.arrays import FloatArray, IntArray
 from ubl_graph.errors import SolverError
 from ubl_graph.problem import Problem
-from ubl_graph.solve.lm import Solution
+from ubl_graph.solve.banded import BandedFactor
+from ubl_graph.solve.normal import NormalEquations, Point
+from ubl_graph.solve.rounds import Solution
 
-#: Shares of the diagonal added where the normal equations are singular to rounding.
+#: Shares of the diagonal added where the normal equations are singular to rounding. What only a
+#: prior of 1e5 m holds beside a sensor of centimetres is at the edge of what double precision
+#: resolves. A ridge of rounding's size then lets the factorisation pass; it cuts standard
+#: deviations that only say "not observed" anyway.
 RIDGES = (0.0, 1e-14, 1e-13, 1e-12, 1e-11)
 
 
@@ -43,124 +57,183 @@ class Marginals:
 
     def __init__(self, problem: Problem, solution: Solution) -> None:
         self._layout = layout = problem.layout
-        _, jacobian = problem.linearize(solution.x, solution.frozen)
-        normal = sparse.csr_array(jacobian.T @ jacobian)
-        diagonal = normal.diagonal()
-        if not np.isfinite(diagonal).all() or (diagonal <= 0.0).any():
-            raise SolverError("the covariances cannot be computed: an unknown enters no residual")
-        self._scale: FloatArray = 1.0 / np.sqrt(diagonal)
-        scaling = sparse.dia_array((self._scale[None], [0]), shape=normal.shape)
-        normal = sparse.coo_array(scaling @ normal @ scaling)
-        inner = layout.node_count * layout.node_width
-        self._nodes, self._shared = _selected_inverse(normal, inner, layout.node_width)
+        equations = NormalEquations(problem)
+        point = equations.evaluate(solution.x, solution.frozen)
+        factor, self._scale = _scaled_factor(equations, point)
+        node, following = selected_inverse(factor.band, layout.node_width)
+        self._shared = np.empty((0, 0))
+        if len(factor.corner):
+            # The columns of A^-1 C say how much of each shared unknown's error a node takes over.
+            share = factor.solve_transposed(factor.coupling)
+            share = share.reshape(-1, layout.node_width, len(factor.corner))
+            self._shared = factor.inverse_corner()
+            taken = share @ self._shared
+            node += taken @ np.swapaxes(share, 1, 2)
+            following += taken[:-1] @ np.swapaxes(share[1:], 1, 2)
+        self._node, self._following = node, following
 
     def of(self, name: str) -> FloatArray:
         """Covariance of a quantity, SI: (N, size, size) per node, (size, size) if shared."""
         layout = self._layout
-        if name in dict(layout.shared):
-            columns = layout.shared_columns(name)
-            local = columns - layout.node_count * layout.node_width
-            block = self._shared[np.ix_(local, local)]
-        else:
-            columns = layout.node_columns(name, np.arange(layout.node_count))
-            local = columns[0]
-            block = self._nodes[:, local[:, None], local[None, :]]
+        if name not in dict(layout.shared):
+            return self.joint([name])
+        columns = layout.shared_columns(name)
+        local = columns - layout.node_count * layout.node_width
         scale = self._scale[columns] * layout.unit(name)
-        return scale[..., :, None] * block * scale[..., None, :]
+        return scale[:, None] * self._shared[np.ix_(local, local)] * scale[None, :]
+
+    def joint(self, names: Sequence[str]) -> FloatArray:
+        """Joint covariance of some of a node's quantities, SI, in this order: (N, S, S)."""
+        local, scale = self._node_columns(names)
+        block = self._node[:, local[:, None], local[None, :]]
+        return scale[:, :, None] * block * scale[:, None, :]
+
+    def following(self, names: Sequence[str]) -> FloatArray:
+        """Covariance of a node's quantities with the next node's, SI: (N - 1, S, S).
+
+        Rows belong to the earlier node. Between chains it is not zero where they share unknowns.
+        """
+        local, scale = self._node_columns(names)
+        block = self._following[:, local[:, None], local[None, :]]
+        return scale[:-1, :, None] * block * scale[1:, None, :]
+
+    def _node_columns(self, names: Sequence[str]) -> tuple[IntArray, FloatArray]:
+        """Places within a node (S,), and SI scale of each node's columns (N, S)."""
+        layout = self._layout
+        nodes = np.arange(layout.node_count)
+        columns = np.concatenate([layout.node_columns(name, nodes) for name in names], axis=1)
+        units = np.concatenate(
+            [np.full(layout.node_columns(n, nodes[:1]).shape[1], layout.unit(n)) for n in names]
+        )
+        return columns[0], self._scale[columns] * units
 
 
-def _selected_inverse(
-    normal: sparse.coo_array, inner: int, width: int
-) -> tuple[FloatArray, FloatArray]:
-    """Diagonal blocks of the inverse of a banded matrix with a border.
-
-    Parameters
-    ----------
-    normal : sparse array, shape (n, n)
-        Symmetric; its first `inner` columns are banded, the others are the border.
-    inner, width : int
-        Columns of all nodes; columns of one node.
-
-    Returns
-    -------
-    array, shape (inner / width, width, width), and array, shape (n - inner, n - inner)
-    """
-    row, column = (np.asarray(i, dtype=np.int64) for i in normal.coords)
-    data = np.asarray(normal.data, dtype=np.float64)
-    border = int(column.max()) + 1 - inner
-    banded = _banded(row, column, data, inner)
-    factor = _factor(banded)
-    blocks = _takahashi(factor, width)
-    if border == 0:
-        return blocks, np.empty((0, 0))
-    coupling = np.zeros((inner, border))
-    edge = (row < inner) & (column >= inner)
-    coupling[row[edge], column[edge] - inner] = data[edge]
-    corner = np.zeros((border, border))
-    corners = (row >= inner) & (column >= inner)
-    corner[row[corners] - inner, column[corners] - inner] = data[corners]
-    solved = cho_solve_banded((factor, True), coupling)
-    shared = np.linalg.inv(corner - coupling.T @ solved)
-    per_node = solved.reshape(-1, width, border)
-    return blocks + per_node @ shared @ np.swapaxes(per_node, 1, 2), shared
-
-
-def _factor(banded: FloatArray) -> FloatArray:
-    """Banded Cholesky factor of a matrix of unit diagonal.
-
-    What only a prior of 1e5 m holds beside a sensor of centimetres is at the edge of what double
-    precision resolves. A ridge of rounding's size then lets the factorisation pass; it cuts
-    standard deviations that only say "not observed" anyway.
-    """
+def _scaled_factor(equations: NormalEquations, point: Point) -> tuple[BandedFactor, FloatArray]:
+    """Factor of the normal matrix scaled to unit diagonal, and the columns' scale."""
     for ridge in RIDGES:
-        matrix = banded.copy()
-        matrix[0] += ridge
+        band, coupling, corner = equations.matrix(point)
+        diagonal = np.concatenate([band[0], corner.diagonal()])
+        if not np.isfinite(diagonal).all() or (diagonal <= 0.0).any():
+            raise SolverError("the covariances cannot be computed: an unknown enters no residual")
+        scale: FloatArray = 1.0 / np.sqrt(diagonal)
+        inner = band.shape[1]
+        for lag in range(len(band)):
+            band[lag, : inner - lag] *= scale[: inner - lag] * scale[lag:inner]
+        coupling *= scale[:inner, None] * scale[inner:]
+        corner *= scale[inner:, None] * scale[inner:]
+        band[0] += ridge
         try:
-            return cholesky_banded(matrix, lower=True, overwrite_ab=True, check_finite=False)
+            return BandedFactor(band, coupling, corner), scale
         except np.linalg.LinAlgError:
             continue
     raise SolverError("the covariances cannot be computed: the normal equations are singular")
 
 
-def _banded(row: IntArray, column: IntArray, data: FloatArray, inner: int) -> FloatArray:
-    """Lower band storage of the first `inner` columns: band[i - j, j] = A[i, j]."""
-    keep = (row >= column) & (row < inner)
-    row, column, data = row[keep], column[keep], data[keep]
-    band = np.zeros((int((row - column).max(initial=0)) + 1, inner))
-    band[row - column, column] = data
-    return band
+@dataclass(frozen=True, eq=False)
+class _Backward:
+    """How each node depends on those that follow.
 
-
-def _takahashi(factor: FloatArray, width: int) -> FloatArray:
-    """Diagonal blocks of (L L')^-1 from L in lower band storage, `width` columns a block.
-
-    For block column k of L, [L_kk; F_k] with F_k the rows below, and S the inverse's block over
-    those rows (already known):  X = -S F_k L_kk^-1,  inverse_kk = L_kk^-T L_kk^-1 - X' ... X.
+    Attributes
+    ----------
+    gain : array, shape (N, W, S)
+        G_k: of the S columns of the nodes in reach.
+    noise : array, shape (N, W, W)
+        Covariance of what they do not say.
     """
+
+    gain: FloatArray
+    noise: FloatArray
+
+
+def selected_inverse(factor: FloatArray, width: int) -> tuple[FloatArray, FloatArray]:
+    """Blocks of (L L')^-1 on the diagonal and right of it.
+
+    Parameters
+    ----------
+    factor : array, shape (reach, n)
+        L in lower band storage: factor[i - j, j] = L[i, j].
+    width : int
+        Columns of a node.
+
+    Returns
+    -------
+    array, shape (N, width, width)
+        Covariance of each node.
+    array, shape (N - 1, width, width)
+        Covariance of each node (rows) with the next one (columns).
+    """
+    backward = _backward(factor, width)
+    count, _, size = backward.gain.shape
+    length = max(1, round(np.sqrt(count / 2.0)))
+    pieces = -(-count // length)
+    # Nodes that only fill up the first piece: they stand before all others and change nothing.
+    extra = pieces * length - count
+    gain = _filled(backward.gain, extra).reshape(pieces, length, width, size)
+    noise = _filled(backward.noise, extra).reshape(pieces, length, width, width)
+    beyond = _carried(*_composed(gain, noise))
+    node = np.empty_like(noise)
+    following = np.empty_like(noise)
+    for k in range(length - 1, -1, -1):
+        cross = gain[:, k] @ beyond
+        here = cross @ np.swapaxes(gain[:, k], 1, 2) + noise[:, k]
+        node[:, k] = 0.5 * (here + np.swapaxes(here, 1, 2))
+        following[:, k] = cross[:, :, :width]
+        beyond = _shifted(node[:, k], cross, beyond)
+    return (
+        node.reshape(-1, width, width)[extra:],
+        following.reshape(-1, width, width)[extra:-1],
+    )
+
+
+def _backward(factor: FloatArray, width: int) -> _Backward:
+    """Gains and noises of all nodes."""
     reach, n = factor.shape
-    nodes = n // width
-    span = -(-(reach - 1) // width)  # blocks below the diagonal that a column may reach
+    span = max(1, -(-(reach - 1) // width))
     size = span * width
-    out = np.empty((nodes, width, width))
-    known = np.zeros((size, size))  # the inverse over the `span` blocks below the current one
-    eye = np.eye(width)
-    lag = np.arange(width + size)[:, None] - np.arange(width)[None, :]
-    inside = (lag >= 0) & (lag < reach)
-    lag = np.where(inside, lag, 0)
-    padded = np.concatenate([factor, np.zeros((reach, width))], axis=1)
-    for k in range(nodes - 1, -1, -1):
-        first = k * width
-        block = np.where(inside, padded[lag, first + np.arange(width)], 0.0)
-        inverse = np.linalg.solve(block[:width], eye)
-        below = block[width:] @ inverse
-        cross = -known @ below
-        here = inverse.T @ inverse - below.T @ cross
-        out[k] = 0.5 * (here + here.T)
-        if size:
-            grown = np.empty((width + size, width + size))
-            grown[:width, :width] = out[k]
-            grown[width:, :width] = cross
-            grown[:width, width:] = cross.T
-            grown[width:, width:] = known
-            known = grown[:size, :size]
+    block = np.zeros((n // width, width + size, width))
+    for column in range(width):
+        rows = min(reach, width + size - column)
+        block[:, column : column + rows, column] = factor[:rows, column::width].T
+    inverse = np.linalg.inv(block[:, :width])
+    gain = -np.swapaxes(block[:, width:] @ inverse, 1, 2)
+    return _Backward(gain, np.swapaxes(inverse, 1, 2) @ inverse)
+
+
+def _filled(blocks: FloatArray, extra: int) -> FloatArray:
+    return np.concatenate([np.zeros((extra, *blocks.shape[1:])), blocks]) if extra else blocks
+
+
+def _composed(gain: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Each piece as one step: P at its first node is M P' M' + Q of P' beyond its last node."""
+    pieces, length, width, size = gain.shape
+    through = np.broadcast_to(np.eye(size), (pieces, size, size))
+    added = np.zeros((pieces, size, size))
+    for k in range(length - 1, -1, -1):
+        g = gain[:, k]
+        cross = g @ added
+        here = cross @ np.swapaxes(g, 1, 2) + noise[:, k]
+        through = np.concatenate([g @ through, through[:, : size - width]], axis=1)
+        added = _shifted(here, cross, added)
+    return through, added
+
+
+def _carried(through: FloatArray, added: FloatArray) -> FloatArray:
+    """P beyond the last node of each piece, from the last piece backwards: (pieces, S, S)."""
+    beyond = np.zeros_like(added)
+    for k in range(len(added) - 1, 0, -1):
+        p = through[k] @ beyond[k] @ through[k].T + added[k]
+        beyond[k - 1] = 0.5 * (p + p.T)
+    return beyond
+
+
+def _shifted(here: FloatArray, cross: FloatArray, beyond: FloatArray) -> FloatArray:
+    """P one node earlier: the node comes in, the farthest one drops out."""
+    width, size = here.shape[1], beyond.shape[1]
+    keep = size - width
+    out = np.empty_like(beyond)
+    out[:, :width, :width] = here
+    if keep:
+        out[:, :width, width:] = cross[:, :, :keep]
+        out[:, width:, :width] = np.swapaxes(cross[:, :, :keep], 1, 2)
+        out[:, width:, width:] = beyond[:, :keep, :keep]
     return out

@@ -1,0 +1,227 @@
+"""Levenberg-Marquardt's schedule and rounds, the same for every engine, and what came of them.
+
+The schedule is Cao's (2017, Table 1): lambda starts at 1e-3 and changes by a factor of ten. It is
+GTSAM's in all else, so that two engines walk the same steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from ubl_graph.arrays import FloatArray
+from ubl_graph.errors import SolverError
+from ubl_graph.problem import Frozen, Problem
+
+INITIAL_LAMBDA, LAMBDA_FACTOR, LARGEST_LAMBDA = 1e-3, 10.0, 1e10
+#: A step is taken where it lowers the cost by more than this share of what was predicted.
+LEAST_FIDELITY = 1e-3
+#: Where a step changes the cost by less than this share, no other lambda is tried.
+SMALL_CHANGE = 1e-5
+#: A solve is done when an iteration lowers the cost by less than this share of it,
+RELATIVE_DECREASE = 1e-8
+#: or by less than this: a step of a ten-thousandth of a standard deviation.
+ABSOLUTE_DECREASE = 1e-9
+#: Rounds, at most, in which the interpolation's variance is taken anew at the last estimate.
+FREEZE_ROUNDS = 5
+#: They end when no standard deviation changes by more than this share.
+FREEZE_TOLERANCE = 1e-4
+
+#: Widths by which `graduated` multiplies the robust rows' standard deviations, one after another,
+GRADUATION = (30.0, 10.0, 3.0)
+#: and iterations for each: the next width begins somewhere near in any case.
+GRADUATION_ITERATIONS = 10
+
+#: Called with the iteration's number and cost.
+Progress = Callable[[int, float], None]
+
+
+class Descent(Protocol):
+    """A run of Levenberg-Marquardt that is under way."""
+
+    @property
+    def cost(self) -> float:
+        """Sum of the losses where it is."""
+        ...
+
+    @property
+    def damping(self) -> float:
+        """Lambda of the next step."""
+        ...
+
+    def iterate(self) -> None:
+        """Take one step, or none where no lambda lowers the cost."""
+        ...
+
+    def vector(self) -> FloatArray:
+        """The flat vector where it is."""
+        ...
+
+
+class Engine(Protocol):
+    """What minimises a problem's cost."""
+
+    @property
+    def name(self) -> str:
+        """As the option `solver` names it."""
+        ...
+
+    @property
+    def problem(self) -> Problem:
+        """What it minimises."""
+        ...
+
+    def begin(self, x: FloatArray, frozen: Frozen) -> Descent:
+        """Start a run at `x`."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Where a solver ended.
+
+    Attributes
+    ----------
+    x : array
+        The flat vector of all unknowns.
+    frozen : tuple
+        What was held fixed in the last round; the covariance belongs to it.
+    cost : float
+        Sum of the losses at `x`.
+    iterations : int
+        Of all rounds.
+    trouble : str
+        Why it did not come to rest; empty where it did.
+    """
+
+    x: FloatArray
+    frozen: Frozen
+    cost: float
+    iterations: int
+    trouble: str
+
+    @property
+    def converged(self) -> bool:
+        """Whether the cost came to rest."""
+        return not self.trouble
+
+
+def solve(
+    engine: Engine, x: FloatArray, max_iterations: int = 100, progress: Progress | None = None
+) -> Solution:
+    """Minimise a problem's cost from the start `x` by Levenberg-Marquardt.
+
+    Parameters
+    ----------
+    engine : Engine
+        What minimises, and what.
+    x : array
+        Start, flat vector.
+    max_iterations : int
+        Of each round; between rounds the interpolation's variance is taken anew, and most
+        problems, whose pings begin and end at nodes, need one round.
+    progress : callable, optional
+        Called after each iteration.
+
+    Raises
+    ------
+    SolverError
+        Where the start or the solver's answer is not finite, or the engine gives up.
+    """
+    if not np.isfinite(x).all():
+        raise SolverError("the start of the solver holds values that are not finite")
+    frozen = engine.problem.frozen(x)
+    used, cost = 0, np.inf
+    for _ in range(FREEZE_ROUNDS):
+        x, cost, iterations, trouble = _round(engine, x, frozen, max_iterations, used, progress)
+        used += iterations
+        anew = engine.problem.frozen(x)
+        if trouble or _change(frozen, anew) < FREEZE_TOLERANCE:
+            return Solution(x, frozen, cost, used, trouble)
+        frozen = anew
+    trouble = f"the interpolation's variance did not settle in {FREEZE_ROUNDS} rounds"
+    return Solution(x, frozen, cost, used, trouble)
+
+
+def at_rest(before: float, after: float) -> bool:
+    """Whether a cost that went from `before` to `after` is where it will stay."""
+    return before - after <= ABSOLUTE_DECREASE + RELATIVE_DECREASE * after
+
+
+def graduated(engine: Engine, x: FloatArray) -> FloatArray:
+    """Approach a robust problem from its convex side: a start for `solve`.
+
+    The standard deviations of the robust rows begin 30 times too wide, where no ping is an
+    outlier, and shrink in steps; each step starts where the last one ended. It finds the good
+    minimum where a direct solve, begun near a wrong one, lets the true pings be the outliers.
+
+    Parameters
+    ----------
+    engine : Engine
+        What minimises, and what.
+    x : array
+        Start, flat vector.
+
+    Returns
+    -------
+    array
+        Flat vector after the last step but one; `solve` does the last.
+
+    Raises
+    ------
+    SolverError
+        As `solve` does.
+    """
+    for width in GRADUATION:
+        held = engine.problem.frozen(x)
+        wide = tuple(None if sigma is None else width * sigma for sigma in held)
+        x, *_ = _round(engine, x, wide, GRADUATION_ITERATIONS, 0, None)
+    return x
+
+
+def _round(
+    engine: Engine,
+    x: FloatArray,
+    frozen: Frozen,
+    most: int,
+    before: int,
+    progress: Progress | None,
+) -> tuple[FloatArray, float, int, str]:
+    """One run of the engine: estimate, cost, iterations, and what went wrong."""
+    descent = engine.begin(x, frozen)
+    cost, done, trouble = _descend(descent, most, before, progress)
+    answer = descent.vector()
+    if not np.isfinite(answer).all():
+        raise SolverError("Levenberg-Marquardt ended in values that are not finite")
+    return answer, cost, done, trouble
+
+
+def _descend(
+    descent: Descent, most: int, before: int, progress: Progress | None
+) -> tuple[float, int, str]:
+    """Iterate until the cost comes to rest: cost, iterations, and what went wrong."""
+    cost = descent.cost
+    for done in range(1, most + 1):
+        descent.iterate()
+        previous, cost = cost, descent.cost
+        if not np.isfinite(cost):
+            raise SolverError("Levenberg-Marquardt met a cost that is not finite")
+        if progress is not None:
+            progress(before + done, cost)
+        if at_rest(previous, cost):
+            exhausted = descent.damping >= LARGEST_LAMBDA
+            return cost, done, "no step lowers the cost, however damped" if exhausted else ""
+    return cost, most, f"the cost did not come to rest in {most} iterations (max_iterations)"
+
+
+def _change(before: Frozen, after: Frozen) -> float:
+    """Largest relative change of what is held fixed."""
+    changes = [
+        float(np.max(np.abs(b / a - 1.0), initial=0.0))
+        for a, b in zip(before, after, strict=True)
+        if a is not None and b is not None
+    ]
+    return max(changes, default=0.0)
