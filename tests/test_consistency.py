@@ -3,7 +3,7 @@
 Each run draws truth from the motion prior, the sound speed's error and walk and the DVL's errors
 from theirs, and noise as the records state it. The NEES of n independent runs with d degrees of
 freedom is chi-square with n d degrees; its mean must lie within the two-sided 99.9 % bounds. A
-run gives one node in its middle and one at its end, judged apart.
+run gives a node in its middle, one at its end, and a time halfway between two nodes, judged apart.
 """
 
 from __future__ import annotations
@@ -34,10 +34,14 @@ DURATION = 160.0
 
 @dataclass(frozen=True)
 class Nees:
-    """NEES of one run at its middle and end node: horizontal (2) and full (3) position."""
+    """NEES of one run by place: horizontal (2) and full (3) position, velocity (3)."""
 
-    horizontal: tuple[float, float]
-    position: tuple[float, float]
+    horizontal: tuple[float, ...]
+    position: tuple[float, ...]
+    velocity: tuple[float, ...]
+
+
+PLACES = ("middle", "end", "between nodes")
 
 
 def squared(error: np.ndarray, covariance: np.ndarray) -> float:
@@ -57,14 +61,20 @@ def assert_consistent(values: list[float], dof: int, what: str) -> None:
     assert low < mean < high, f"{what}: mean NEES {mean:.3f} outside {low:.3f} to {high:.3f}"
 
 
-def node_nees(result: Result, truth: Truth) -> Nees:
+def nees(result: Result, truth: Truth) -> Nees:
+    """Judge a run at `PLACES`."""
     track = result.segments[0].trajectory
-    nodes = [len(track.t) // 2, len(track.t) - 1]
-    errors = track.position[nodes] - truth.position(track.t[nodes])
-    pairs = list(zip(errors, track.covariance[nodes], strict=True))
+    middle = len(track.t) // 2
+    longest = middle + int(np.argmax(np.diff(track.t[middle : middle + 6])))
+    between = 0.5 * (track.t[longest] + track.t[longest + 1])
+    states = track.at([track.t[middle], track.t[-1], between])
+    errors = states.position - truth.position(states.t)
+    speeds = states.velocity - truth.velocity(states.t)
+    pairs = list(zip(errors, states.covariance, strict=True))
     return Nees(
         tuple(squared(e[:2], c[:2, :2]) for e, c in pairs),
         tuple(squared(e, c) for e, c in pairs),
+        tuple(squared(e, c) for e, c in zip(speeds, states.velocity_covariance, strict=True)),
     )
 
 
@@ -97,14 +107,15 @@ def free_runs(options: Options, runs: int) -> list[Nees]:
         mission, truth = free_swimmer(seed, options)
         result = smooth(mission)
         assert result.status == "converged", f"seed {seed}: {result.reason}"
-        out.append(node_nees(result, truth))
+        out.append(nees(result, truth))
     return out
 
 
 def check(runs: list[Nees], what: str) -> None:
-    for place, name in enumerate(("middle", "end")):
+    for place, name in enumerate(PLACES):
         assert_consistent([r.horizontal[place] for r in runs], 2, f"{what}, {name}, horizontal")
         assert_consistent([r.position[place] for r in runs], 3, f"{what}, {name}, position")
+        assert_consistent([r.velocity[place] for r in runs], 3, f"{what}, {name}, velocity")
 
 
 def dvl_vehicle(seed: int, options: Options) -> tuple[Mission, Truth, DvlErrors]:
@@ -156,7 +167,7 @@ def dvl_runs(runs: int) -> tuple[list[Nees], dict[str, list[float]]]:
         mission, truth, truths = dvl_vehicle(seed, Options(loss="none"))
         result = smooth(mission)
         assert result.status == "converged", f"seed {seed}: {result.reason}"
-        out.append(node_nees(result, truth))
+        out.append(nees(result, truth))
         for name, value in truths.items():
             found = result.shared[name]
             off = found.value - np.atleast_1d(value)
@@ -200,5 +211,5 @@ def test_wrong_model_is_found_out():
     for seed in range(30):
         mission, truth = free_swimmer(seed, WNOA)
         options = replace(WNOA, estimate_sound_speed=False)
-        high.append(node_nees(smooth(replace(mission, options=options)), truth).horizontal[0])
+        high.append(nees(smooth(replace(mission, options=options)), truth).horizontal[0])
     assert np.mean(high) > 2.0 * bounds(30, 2)[1]

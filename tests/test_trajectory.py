@@ -67,9 +67,11 @@ def test_interpolation_is_the_conditional_mean_of_the_prior(order, dt, s):
         ours = interpolation_weights(order, np.array([dt]), np.array([s]), derivative)[0]
         expected = np.concatenate([lam[derivative], psi[derivative]])
         np.testing.assert_allclose(ours, expected, atol=1e-8 * dt**order, rtol=1e-8)
-    variance = (part - psi @ q @ psi.T)[0, 0]
-    ours = interpolation_variance(order, dt, s)
-    assert ours == pytest.approx(variance, abs=1e-8 * q[0, 0])
+    left = part - psi @ q @ psi.T
+    for derivative in (0, 1):
+        ours = interpolation_variance(order, dt, s, derivative)
+        variance, whole = left[derivative, derivative], q[derivative, derivative]
+        assert ours == pytest.approx(variance, abs=1e-8 * whole)
 
 
 @ORDERS
@@ -113,7 +115,7 @@ def test_trajectory_reproduces_polynomials_between_its_nodes(order):
     np.testing.assert_allclose(states.velocity, velocity, atol=1e-8)
 
 
-def test_covariance_is_the_nodes_at_nodes_and_larger_in_between():
+def test_without_joint_covariances_that_of_the_position_is_linear_between_nodes():
     trajectory, _ = polynomial_trajectory(2)
     at_nodes = trajectory.at(trajectory.t)
     np.testing.assert_allclose(at_nodes.covariance, trajectory.covariance, atol=1e-12)
@@ -122,6 +124,7 @@ def test_covariance_is_the_nodes_at_nodes_and_larger_in_between():
     dt = np.diff(trajectory.t)
     expected = np.array([1.0, 4.0, 9.0]) + (dt**3 / 192)[:, None] * [0.1, 0.1, 0.3]
     np.testing.assert_allclose(np.einsum("nii->ni", between), expected)
+    assert np.isnan(at_nodes.velocity_covariance).all()
 
 
 @pytest.mark.parametrize("t", [-1.0, 9.0, np.nan, np.inf])

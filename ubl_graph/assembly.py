@@ -151,7 +151,7 @@ def _status(
     if np.median(sigma) > limit:
         node = int(np.argsort(sigma)[len(sigma) // 2])
         return "unobservable", (
-            f"the data do not determine the track {_direction(vectors[node, :, -1])} "
+            f"the data do not determine the track {direction(vectors[node, :, -1])} "
             f"(standard deviation {sigma[node]:.0f} m at half of the nodes or more)"
         )
     if rival is not None:
@@ -161,12 +161,12 @@ def _status(
     return "converged", ""
 
 
-def _direction(axis: FloatArray) -> str:
+def direction(axis: FloatArray) -> str:
     """A direction in words: along the vertical, or its bearing."""
     if abs(axis[2]) > 0.9:
         return "vertically"
-    bearing = np.rad2deg(np.arctan2(axis[0], axis[1])) % 180.0
-    return f"along {bearing:.0f}/{bearing + 180.0:.0f} degrees"
+    bearing = round(float(np.rad2deg(np.arctan2(axis[0], axis[1])))) % 180
+    return f"along {bearing}/{bearing + 180} degrees"
 
 
 def _chi_square(problem: Problem, solution: Solution) -> tuple[float, int]:

@@ -14,7 +14,7 @@ from time import perf_counter
 import numpy as np
 
 from ubl_graph.arrays import FloatArray
-from ubl_graph.assembly import assemble_segment, beacons_of, shared_of
+from ubl_graph.assembly import assemble_segment, beacons_of, direction, shared_of
 from ubl_graph.errors import SolverError
 from ubl_graph.graph import SegmentModel, build_problem, model_segment
 from ubl_graph.initial import START_LIMIT, Starts, find_starts
@@ -23,7 +23,7 @@ from ubl_graph.problem import Problem
 from ubl_graph.result import DOWN_WEIGHTED, Result, SegmentResult, Shared
 from ubl_graph.solve.choice import Choice, choose
 from ubl_graph.solve.marginals import Marginals
-from ubl_graph.solve.rounds import Engine, Solution, at_rest, graduated, solve
+from ubl_graph.solve.rounds import Engine, Solution, confirms, graduated, solve
 from ubl_graph.track import Track, mirror_images, place, track_of, unanchored
 
 #: A second track counts as no worse where its cost is higher by less than this: odds of 20 to 1.
@@ -200,15 +200,15 @@ def _solve_from(
 def _confirmed(work: _Work, choice: Choice, found: Solution) -> tuple[Solution, str]:
     """The scout's answer, shown to the other engine; the one that counts, and who gave it."""
     scout, last = choice.scout, choice.last
-    if last is scout or not found.converged:
+    if last is scout:
         return found, scout.name
     try:
+        if found.converged and confirms(last, found):
+            return found, f"{scout.name}, confirmed by {last.name}"
         again = work.solve(last, found.x)
     except SolverError as error:
         work.warn("", f"{last.name} could not confirm the answer of {scout.name}: {error}")
         return found, scout.name
-    if at_rest(found.cost, again.cost):
-        return found, f"{scout.name}, confirmed by {last.name}"
     return replace(again, iterations=found.iterations + again.iterations), last.name
 
 
@@ -234,7 +234,8 @@ def _rival(
         extra = other.cost - best.cost
         if apart > covered and extra < AMBIGUOUS_COST:
             return (
-                f"ambiguous: another track, {apart:.0f} m away (rms), fits as well (its cost is "
+                f"ambiguous: another track, {apart:.0f} m away (rms, mostly "
+                f"{direction(np.linalg.eigh(gap.T @ gap)[1][:, -1])}), fits as well (its cost is "
                 f"{extra:.2g} higher); a start, a fix, a turn or a second beacon off the line "
                 "would tell"
             )

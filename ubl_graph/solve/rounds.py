@@ -22,9 +22,9 @@ LEAST_FIDELITY = 1e-3
 #: Where a step changes the cost by less than this share, no other lambda is tried.
 SMALL_CHANGE = 1e-5
 #: A solve is done when an iteration lowers the cost by less than this share of it,
-RELATIVE_DECREASE = 1e-8
-#: or by less than this: a step of a ten-thousandth of a standard deviation.
-ABSOLUTE_DECREASE = 1e-9
+RELATIVE_DECREASE = 1e-10
+#: or by less than this: a step of a hundred-thousandth of a standard deviation.
+ABSOLUTE_DECREASE = 1e-10
 #: Rounds, at most, in which the interpolation's variance is taken anew at the last estimate.
 FREEZE_ROUNDS = 5
 #: They end when no standard deviation changes by more than this share.
@@ -149,6 +149,26 @@ def solve(
 def at_rest(before: float, after: float) -> bool:
     """Whether a cost that went from `before` to `after` is where it will stay."""
     return before - after <= ABSOLUTE_DECREASE + RELATIVE_DECREASE * after
+
+
+def confirms(engine: Engine, solution: Solution) -> bool:
+    """Whether an engine, begun at another's solution, finds nothing better.
+
+    Parameters
+    ----------
+    engine : Engine
+        Of the same problem.
+    solution : Solution
+        Of the other engine.
+
+    Raises
+    ------
+    SolverError
+        Where the engine gives up.
+    """
+    descent = engine.begin(solution.x, solution.frozen)
+    descent.iterate()
+    return at_rest(solution.cost, descent.cost)
 
 
 def graduated(engine: Engine, x: FloatArray) -> FloatArray:
