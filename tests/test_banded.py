@@ -24,6 +24,7 @@ from ubl_graph import (
     Segment,
     SoundSpeedProfile,
     Start,
+    TwoWayRange,
     smooth,
 )
 from ubl_graph.errors import SolverError
@@ -289,6 +290,46 @@ def test_every_step_is_gtsams(options, seed):
         assert ours.cost == pytest.approx(theirs.cost, rel=1e-6)
     if "loss" in options:
         assert (np.diff(dampings) > 0.0).any(), "no step was refused"
+
+
+def valley(nodes: int) -> tuple[Problem, np.ndarray]:
+    """Vertical and sound speed trade against each other: beacons at one depth, no pressure sensor.
+
+    The valley is curved, so steps are refused in the middle of it; the more pings, the more so.
+    """
+    rng = np.random.default_rng(1)
+    t = 2.0 * np.arange(float(nodes))
+    track = np.stack([300 * np.sin(t / 300), 300 * np.cos(t / 300), 0 * t - 10.0], axis=1)
+    angles = np.arange(3) * 2.0 * np.pi / 3.0
+    beacons = tuple(
+        Beacon(f"B{i}", [800.0 * np.cos(a), 800.0 * np.sin(a), -500.0])
+        for i, a in enumerate(angles)
+    )
+    which = np.arange(nodes - 1) % 3
+    places = np.stack([b.position for b in beacons])[which]
+    ways = [np.linalg.norm(track[end] - places, axis=1) for end in (slice(0, -1), slice(1, None))]
+    travel = sum(ways) / 1500.0 + 1e-4 * rng.normal(size=nodes - 1)
+    names = [beacons[i].name for i in which]
+    pings = TwoWayRange(names, t[:-1], t[1:], travel, 1e-4)
+    options = Options(acceleration_psd=2e-2)
+    profile = SoundSpeedProfile.constant(1500.0)
+    problem = problem_of(Mission((Segment("", pings),), beacons, profile, options=options))
+    x = np.zeros(problem.layout.size)
+    problem.layout.put(x, "position", track + rng.normal(size=track.shape))
+    return problem, x
+
+
+def test_a_refused_step_in_a_curved_valley_is_not_its_end():
+    """The step that Newton would still take at the end promises next to nothing."""
+    problem, x = valley(5000)
+    engine = BandedEngine(problem)
+    solution = solve(engine, x)
+    assert solution.converged
+    equations = NormalEquations(problem)
+    point = equations.evaluate(solution.x, solution.frozen)
+    gradient = equations.gradient(point)
+    step = BandedFactor(*equations.matrix(point)).solve(-gradient)
+    assert -0.5 * gradient @ step < 1e-6
 
 
 def test_a_matrix_that_is_not_positive_definite_is_refused():

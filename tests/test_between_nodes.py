@@ -69,7 +69,7 @@ def test_extra_nodes_say_the_same(motion):
         found, expected = getattr(at, name), finer.joint.node[there, block, block]
         sigma = np.sqrt(np.einsum("nii->ni", expected))
         gap = np.abs(found - expected) / (sigma[:, :, None] * sigma[:, None, :])
-        # What normal equations of condition 1e11 leave of double precision.
+        # What normal equations of condition 1e12 leave of double precision.
         assert gap.max() < 1e-4, name
 
 

@@ -18,7 +18,7 @@ from ubl_graph.solve.rounds import (
     LAMBDA_FACTOR,
     LARGEST_LAMBDA,
     LEAST_FIDELITY,
-    SMALL_CHANGE,
+    RELATIVE_DECREASE,
 )
 
 _pbtrf, _pbtrs, _tbtrs, _potrf, _potrs = get_lapack_funcs(
@@ -159,7 +159,7 @@ class BandedDescent:
             self._point = trial
             self.damping /= LAMBDA_FACTOR
             return True
-        return abs(lowered) < SMALL_CHANGE * now.cost
+        return abs(lowered) < RELATIVE_DECREASE * now.cost
 
     def _step(self, gradient: FloatArray) -> FloatArray | None:
         """Solution of (J'J + lambda I) step = -J'r, or None where that is singular to rounding."""

@@ -8,7 +8,12 @@ from ubl_graph.arrays import FloatArray
 from ubl_graph.errors import SolverError
 from ubl_graph.gtsam_view import GraphView
 from ubl_graph.problem import Frozen, Problem
-from ubl_graph.solve.rounds import INITIAL_LAMBDA, LAMBDA_FACTOR, LARGEST_LAMBDA
+from ubl_graph.solve.rounds import (
+    INITIAL_LAMBDA,
+    LAMBDA_FACTOR,
+    LARGEST_LAMBDA,
+    RELATIVE_DECREASE,
+)
 
 
 class GtsamEngine:
@@ -95,6 +100,7 @@ def _parameters(view: GraphView) -> gtsam.LevenbergMarquardtParams:
     parameters.setlambdaInitial(INITIAL_LAMBDA)
     parameters.setlambdaFactor(LAMBDA_FACTOR)
     parameters.setlambdaUpperBound(LARGEST_LAMBDA)
+    parameters.setRelativeErrorTol(RELATIVE_DECREASE)
     parameters.setOrdering(view.ordering())
     parameters.setLinearSolverType("SEQUENTIAL_CHOLESKY")
     return parameters

@@ -19,11 +19,11 @@ from ubl_graph.problem import Frozen, Problem
 INITIAL_LAMBDA, LAMBDA_FACTOR, LARGEST_LAMBDA = 1e-3, 10.0, 1e10
 #: A step is taken where it lowers the cost by more than this share of what was predicted.
 LEAST_FIDELITY = 1e-3
-#: Where a step changes the cost by less than this share, no other lambda is tried.
-SMALL_CHANGE = 1e-5
 #: A solve is done when an iteration lowers the cost by less than this share of it,
 RELATIVE_DECREASE = 1e-10
-#: or by less than this: a step of a hundred-thousandth of a standard deviation.
+#: or by less than this: a step of a hundred-thousandth of a standard deviation. Where a step raises
+#: the cost by no more than that share, no other lambda is tried. (GTSAM's own 1e-5 there takes a
+#: refused step in a curved valley for the valley's end.)
 ABSOLUTE_DECREASE = 1e-10
 #: Rounds, at most, in which the interpolation's variance is taken anew at the last estimate.
 FREEZE_ROUNDS = 5
@@ -232,7 +232,7 @@ def _descend(
         if progress is not None:
             progress(before + done, cost)
         if at_rest(previous, cost):
-            exhausted = descent.damping >= LARGEST_LAMBDA
+            exhausted = descent.damping >= LARGEST_LAMBDA and cost > ABSOLUTE_DECREASE
             return cost, done, "no step lowers the cost, however damped" if exhausted else ""
     return cost, most, f"the cost did not come to rest in {most} iterations (max_iterations)"
 
