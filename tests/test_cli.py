@@ -189,6 +189,39 @@ def test_bad_input_is_one_line_and_leaves_nothing(dive, harm, named):
     assert sorted(p.name for p in dive.iterdir()) == before
 
 
+def test_the_solver_is_the_command_lines_then_the_files(dive):
+    """The answer is the same; result.json and mission.json say who gave it."""
+    with (dive / "dive.toml").open("a") as file:
+        file.write('[options]\nsolver = "banded"\n')
+    tracks = {}
+    for name, solver in {
+        "gtsam": "gtsam",
+        "auto": "banded, confirmed by gtsam",
+        "": "banded",
+    }.items():
+        folder = dive / f"out-{name}"
+        arguments = ["--solver", name] if name else []
+        done = command("smooth", dive / "dive.toml", "-o", folder, "--no-figures", *arguments)
+        assert done.returncode == 0, done.stderr
+        assert json.loads((folder / "result.json").read_text())["segments"][0]["solver"] == solver
+        options = json.loads((folder / "mission.json").read_text())["options"]
+        assert options["solver"] == (name or "banded")
+        tracks[name] = np.loadtxt(
+            folder / "trajectory.csv", delimiter=",", skiprows=1, usecols=range(2, 9)
+        )
+    np.testing.assert_allclose(tracks["gtsam"], tracks[""], atol=2e-6)
+    np.testing.assert_array_equal(tracks["auto"], tracks[""])
+
+
+@pytest.mark.parametrize("name", ["lapack", "BANDED", ""])
+def test_an_unknown_solver_is_refused(dive, name):
+    done = command("smooth", dive / "dive.toml", "-o", dive / "out", "--solver", name)
+    assert done.returncode == 2
+    (line,) = done.stderr.strip().splitlines()
+    assert f"'{name}' is not one of auto, gtsam, banded" in line
+    assert not (dive / "out").exists()
+
+
 def test_an_output_that_is_a_file_is_refused_and_kept(dive):
     (dive / "out").write_text("mine")
     done = command("smooth", "dive.toml", "-o", "out", cwd=dive)

@@ -253,12 +253,17 @@ class _System:
         scale = np.exp(theta[:, SCALE])[:, None, None]
         times = travel.time.reshape(n_starts, m, 2) * scale * s.share
         slopes = travel.gradient_a.reshape(n_starts, m, 2, 3) * (scale * s.share)[..., None]
-        total = times.sum(axis=2)
+        # Two legs: adding them is many times faster than numpy's sum over so short an axis.
+        total = times[..., 0] + times[..., 1]
         residual = (total + s.clock * theta[:, CLOCK, None] - s.measured) * self.inverse
         jacobian = np.empty((n_starts, m, PARAMETERS))
-        jacobian[..., EAST_NORTH_UP] = slopes.sum(axis=2)
-        jacobian[..., VELOCITY] = (slopes * self.dt[..., None]).sum(axis=2)
-        jacobian[..., ACCELERATION] = (slopes * self.bend[..., None]).sum(axis=2)
+        for columns, factor in (
+            (EAST_NORTH_UP, np.ones_like(self.dt)),
+            (VELOCITY, self.dt),
+            (ACCELERATION, self.bend),
+        ):
+            legs = slopes * factor[..., None]
+            jacobian[..., columns] = legs[..., 0, :] + legs[..., 1, :]
         jacobian[..., SCALE] = total
         jacobian[..., CLOCK] = s.clock
         return residual, jacobian * self.inverse[:, None]

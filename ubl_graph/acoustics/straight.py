@@ -66,7 +66,7 @@ def straight(profile: SoundSpeedProfile, a: ArrayLike, b: ArrayLike) -> TravelTi
     """
     a, b = point_pairs(a, b)
     line = b - a
-    distance = np.sqrt(np.add.reduce(line * line, axis=1))
+    distance = np.sqrt(np.einsum("ij,ij->i", line, line))
     # Coincident ends have no direction: 0 / 1e-300 makes it zero.
     away = np.maximum(distance, 1e-300)
     found = np.empty(distance.size, dtype=np.bool_)
