@@ -142,11 +142,7 @@ def _smooth_group(
     group = [model for model, _ in searched]
     with work.stage("solve"):
         problem = build_problem(work.mission, group)
-        choice = choose(problem, work.mission.options.solver)
-        if choice.note:
-            work.warn(group[0].segment.name if len(group) == 1 else "", choice.note)
-        solution, rivals = _solve_from(work, choice.scout, group, [s for _, s in searched])
-        solution, solver = _confirmed(work, choice, solution)
+        solution, rivals, solver = _solved(work, problem, group, [s for _, s in searched])
     with work.stage("covariance"):
         marginals = Marginals(problem, solution)
         rival = _rival(problem, solution, marginals, rivals)
@@ -157,6 +153,18 @@ def _smooth_group(
             for chain, model in zip(problem.layout.chains, group, strict=True)
         ]
         return results, shared_of(problem, solution, marginals)
+
+
+def _solved(
+    work: _Work, problem: Problem, group: Sequence[SegmentModel], starts: Sequence[Starts]
+) -> tuple[Solution, list[Solution], str]:
+    """The best solution, the others that were found, and who solved it."""
+    choice = choose(problem, work.mission.options.solver)
+    if choice.note:
+        work.warn(group[0].segment.name if len(group) == 1 else "", choice.note)
+    best, others = _solve_from(work, choice.scout, group, starts)
+    best, solver = _confirmed(work, choice, best)
+    return best, others, solver
 
 
 def _search(work: _Work, model: SegmentModel) -> tuple[SegmentModel, Starts]:

@@ -21,7 +21,6 @@ is a border: Schur's complement adds its part.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -37,6 +36,8 @@ from ubl_graph.solve.rounds import Solution
 #: resolves. A ridge of rounding's size then lets the factorisation pass; it cuts standard
 #: deviations that only say "not observed" anyway.
 RIDGES = (0.0, 1e-14, 1e-13, 1e-12, 1e-11)
+#: Nodes whose blocks are read off the factor at once: what fits the cache.
+AT_ONCE = 4096
 
 
 class Marginals:
@@ -129,22 +130,6 @@ def _scaled_factor(equations: NormalEquations, point: Point) -> tuple[BandedFact
     raise SolverError("the covariances cannot be computed: the normal equations are singular")
 
 
-@dataclass(frozen=True, eq=False)
-class _Backward:
-    """How each node depends on those that follow.
-
-    Attributes
-    ----------
-    gain : array, shape (N, W, S)
-        G_k: of the S columns of the nodes in reach.
-    noise : array, shape (N, W, W)
-        Covariance of what they do not say.
-    """
-
-    gain: FloatArray
-    noise: FloatArray
-
-
 def selected_inverse(factor: FloatArray, width: int) -> tuple[FloatArray, FloatArray]:
     """Blocks of (L L')^-1 on the diagonal and right of it.
 
@@ -162,17 +147,17 @@ def selected_inverse(factor: FloatArray, width: int) -> tuple[FloatArray, FloatA
     array, shape (N - 1, width, width)
         Covariance of each node (rows) with the next one (columns).
     """
-    backward = _backward(factor, width)
-    count, _, size = backward.gain.shape
+    count = factor.shape[1] // width
     length = max(1, round(np.sqrt(count / 2.0)))
     pieces = -(-count // length)
-    # Nodes that only fill up the first piece: they stand before all others and change nothing.
+    # Nodes that only fill up the first piece stand before all others and change nothing.
     extra = pieces * length - count
-    gain = _filled(backward.gain, extra).reshape(pieces, length, width, size)
-    noise = _filled(backward.noise, extra).reshape(pieces, length, width, width)
+    gain, noise = (
+        blocks.reshape(pieces, length, width, -1) for blocks in _backward(factor, width, extra)
+    )
     beyond = _carried(*_composed(gain, noise))
-    node = np.empty_like(noise)
-    following = np.empty_like(noise)
+    # Each node's own covariance takes the place of its noise, which is not needed any more.
+    node, following = noise, np.empty_like(noise)
     for k in range(length - 1, -1, -1):
         cross = gain[:, k] @ beyond
         here = cross @ np.swapaxes(gain[:, k], 1, 2) + noise[:, k]
@@ -185,22 +170,33 @@ def selected_inverse(factor: FloatArray, width: int) -> tuple[FloatArray, FloatA
     )
 
 
-def _backward(factor: FloatArray, width: int) -> _Backward:
-    """Gains and noises of all nodes."""
+def _backward(factor: FloatArray, width: int, extra: int) -> tuple[FloatArray, FloatArray]:
+    """How each node depends on those that follow, behind `extra` empty nodes.
+
+    Returns
+    -------
+    array, shape (extra + N, W, S)
+        Gains G_k, of the S columns of the nodes in reach.
+    array, shape (extra + N, W, W)
+        Covariance of what they do not say.
+    """
     reach, n = factor.shape
-    span = max(1, -(-(reach - 1) // width))
-    size = span * width
-    block = np.zeros((n // width, width + size, width))
-    for column in range(width):
-        rows = min(reach, width + size - column)
-        block[:, column : column + rows, column] = factor[:rows, column::width].T
-    inverse = np.linalg.inv(block[:, :width])
-    gain = -np.swapaxes(block[:, width:] @ inverse, 1, 2)
-    return _Backward(gain, np.swapaxes(inverse, 1, 2) @ inverse)
-
-
-def _filled(blocks: FloatArray, extra: int) -> FloatArray:
-    return np.concatenate([np.zeros((extra, *blocks.shape[1:])), blocks]) if extra else blocks
+    count = n // width
+    size = max(1, -(-(reach - 1) // width)) * width
+    gain = np.zeros((extra + count, width, size))
+    noise = np.zeros((extra + count, width, width))
+    for first in range(0, count, AT_ONCE):
+        nodes = min(AT_ONCE, count - first)
+        there = slice(extra + first, extra + first + nodes)
+        part = factor[:, first * width : (first + nodes) * width]
+        block = np.zeros((nodes, width + size, width))
+        for column in range(width):
+            rows = min(reach, width + size - column)
+            block[:, column : column + rows, column] = part[:rows, column::width].T
+        inverse = np.linalg.inv(block[:, :width])
+        gain[there] = -np.swapaxes(block[:, width:] @ inverse, 1, 2)
+        noise[there] = np.swapaxes(inverse, 1, 2) @ inverse
+    return gain, noise
 
 
 def _composed(gain: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
