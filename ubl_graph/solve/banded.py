@@ -12,7 +12,7 @@ from scipy.linalg import get_lapack_funcs
 
 from ubl_graph.arrays import FloatArray
 from ubl_graph.problem import Frozen, Problem
-from ubl_graph.solve.normal import NormalEquations
+from ubl_graph.solve.normal import NormalEquations, dot
 from ubl_graph.solve.rounds import (
     INITIAL_LAMBDA,
     LAMBDA_FACTOR,
@@ -149,7 +149,7 @@ class BandedDescent:
         if step is None:
             return False
         now = self._point
-        predicted = 0.5 * float(self.damping * (step @ step) - gradient @ step)
+        predicted = 0.5 * (self.damping * dot(step, step) - dot(gradient, step))
         if not predicted >= 0.0:
             return False
         trial = self._equations.evaluate(now.x + step, self._frozen)

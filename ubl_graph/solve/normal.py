@@ -13,6 +13,7 @@ one flat store, band first, so that a place is one number.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -141,7 +142,7 @@ class NormalEquations:
         """Evaluate all rows at `x`."""
         loss = self.problem.loss
         linear = self._matrix @ x - self._target
-        cost = quadratic = 0.5 * float(linear @ linear)
+        cost = quadratic = 0.5 * dot(linear, linear)
         curved: list[tuple[FloatArray, FloatArray]] = []
         for block, held in zip(self.problem.blocks, frozen, strict=True):
             if block.linear:
@@ -152,9 +153,9 @@ class NormalEquations:
                 cost += float(loss.cost(r).sum())
                 root = np.sqrt(loss.weights(r))
                 r, jacobian = root * r, root[:, :, None] * jacobian
-                quadratic += 0.5 * float(np.vdot(r, r))
+                quadratic += 0.5 * dot(r, r)
             else:
-                half = 0.5 * float(np.vdot(r, r))
+                half = 0.5 * dot(r, r)
                 cost, quadratic = cost + half, quadratic + half
             curved.append((r, jacobian))
         return Point(x, cost, quadratic, linear, curved)
@@ -214,6 +215,14 @@ class NormalEquations:
         return self._matrix.T
 
 
+def dot(a: FloatArray, b: FloatArray) -> float:
+    """Sum of the products of two arrays of one shape.
+
+    Not by BLAS: for a sum of microseconds that wakes threads, and waits for them on a busy machine.
+    """
+    return float(np.einsum("i,i->", a.ravel(), b.ravel()))
+
+
 class _Products:
     """Where the products of a block's Jacobian entries go.
 
@@ -231,31 +240,41 @@ class _Products:
         # Every pair of entries of one row, once.
         a, b = np.tril_indices(len(rows))
         same = rows[a] == rows[b]
-        a, b = a[same], b[same]
+        self._a, self._b = a[same], b[same]
         by_place = np.ascontiguousarray(columns.T)
-        i, j = by_place[places[a]], by_place[places[b]]
-        target = shape.place(i, j)
-        # Two places of a row that are the same column (legs that share a node) make a cross
-        # product count twice: (a + b)^2 = a^2 + 2 a b + b^2.
-        twice = (i == j) & (a != b)[:, None]
-        if twice.any():
-            again = np.flatnonzero(twice.any(axis=1))
-            extra = np.where(twice[again], target[again], shape.size)
-            a, b, target = (
-                np.append(a, a[again]),
-                np.append(b, b[again]),
-                np.vstack([target, extra]),
-            )
-        self._a, self._b, self._target = a, b, target
+        # A mission of 100 000 nodes with all kinds of states has 50 million places: halve them.
+        kind = np.int32 if shape.size < np.iinfo(np.int32).max else np.int64
+        self._target = np.empty((len(self._a), columns.shape[0]), dtype=kind)
+        self._step = max(1, CHUNK // max(columns.shape[0], 1))
+        none = np.empty(0, dtype=np.int64)
+        twice: list[tuple[IntArray, IntArray]] = [(none, none)]
+        for some in self._portions():
+            a, b = self._a[some], self._b[some]
+            i, j = by_place[places[a]], by_place[places[b]]
+            self._target[some] = shape.place(i, j)
+            # Two places of a row that are the same column (legs that share a node) make a cross
+            # product count twice: (a + b)^2 = a^2 + 2 a b + b^2.
+            pair, row = np.nonzero((i == j) & (i >= 0) & (a != b)[:, None])
+            twice.append((pair + some.start, row))
+        pair, self._row_twice = (np.concatenate(part) for part in zip(*twice, strict=True))
+        self._a_twice, self._b_twice = self._a[pair], self._b[pair]
+        self._target_twice = self._target[pair, self._row_twice].astype(np.intp)
+
+    def _portions(self) -> Iterator[slice]:
+        """Pairs, as many at a time as the cache holds."""
+        for first in range(0, len(self._a), self._step):
+            yield slice(first, first + self._step)
 
     def add(self, store: FloatArray, entries: FloatArray) -> None:
         """Add the products of (E, M) entries to the store."""
-        step = max(1, CHUNK // max(entries.shape[1], 1))
-        for first in range(0, len(self._a), step):
-            some = slice(first, first + step)
+        for some in self._portions():
             product = entries[self._a[some]]
             product *= entries[self._b[some]]
-            np.add.at(store, self._target[some].ravel(), product.ravel())
+            target = self._target[some].astype(np.intp)
+            np.add.at(store, target.ravel(), product.ravel())
+        row = self._row_twice
+        again = entries[self._a_twice, row] * entries[self._b_twice, row]
+        np.add.at(store, self._target_twice, again)
 
 
 def _entries(jacobian: FloatArray) -> FloatArray:
@@ -304,7 +323,7 @@ class _LinearRows:
 
     def add(self, store: FloatArray, shape: Shape) -> None:
         """Add J'J to the store."""
-        step = max(1, CHUNK // len(self.rows))
+        step = max(1, CHUNK // max(len(self.rows), 1))
         for first in range(0, len(self.data), step):
             some = slice(first, first + step)
             products = _Products(self.columns[some], self.rows, self.places, shape)
