@@ -193,10 +193,22 @@ def _backward(factor: FloatArray, width: int, extra: int) -> tuple[FloatArray, F
         for column in range(width):
             rows = min(reach, width + size - column)
             block[:, column : column + rows, column] = part[:rows, column::width].T
-        inverse = np.linalg.inv(block[:, :width])
+        inverse = _inverse_lower(block[:, :width])
         gain[there] = -np.swapaxes(block[:, width:] @ inverse, 1, 2)
         noise[there] = np.swapaxes(inverse, 1, 2) @ inverse
     return gain, noise
+
+
+def _inverse_lower(lower: FloatArray) -> FloatArray:
+    """Inverses of many small lower triangular matrices (N, W, W), row by row."""
+    inverse = np.zeros_like(lower)
+    for row in range(lower.shape[1]):
+        own = 1.0 / lower[:, row, row]
+        inverse[:, row, row] = own
+        if row:
+            before = np.einsum("nk,nkj->nj", lower[:, row, :row], inverse[:, :row, :row])
+            inverse[:, row, :row] = -own[:, None] * before
+    return inverse
 
 
 def _composed(gain: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
