@@ -45,12 +45,12 @@ from ubl_graph.sim import (
     straight_pass,
     two_way_pings,
 )
-from ubl_graph.solve.banded import BandedEngine, BandedFactor
+from ubl_graph.solve.banded import BandedDescent, BandedEngine, BandedFactor
 from ubl_graph.solve.choice import choose
 from ubl_graph.solve.lm import GtsamEngine
 from ubl_graph.solve.marginals import Marginals, selected_inverse
-from ubl_graph.solve.normal import NormalEquations
-from ubl_graph.solve.rounds import Solution, solve
+from ubl_graph.solve.normal import NormalEquations, Point
+from ubl_graph.solve.rounds import LARGEST_LAMBDA, Solution, confirms, solve
 
 PROFILE = SoundSpeedProfile.constant(1495.0)
 POSITION = 1e-6
@@ -247,7 +247,7 @@ def test_random_graphs_have_the_dense_inverse(drawn):
 @given(
     nodes=st.integers(1, 40),
     width=st.integers(1, 7),
-    span=st.integers(0, 3),
+    span=st.sampled_from([0, 1, 2, 3, 12]),
     seed=st.integers(0, 10_000),
 )
 @settings(max_examples=80, derandomize=True, deadline=None)
@@ -330,6 +330,67 @@ def test_a_refused_step_in_a_curved_valley_is_not_its_end():
     gradient = equations.gradient(point)
     step = BandedFactor(*equations.matrix(point)).solve(-gradient)
     assert -0.5 * gradient @ step < 1e-6
+
+
+class Fake:
+    """Normal equations of x^2/2 in one unknown, with what a test makes of the trial's cost."""
+
+    def __init__(self, *costs: float, curvature: float = 1.0) -> None:
+        self.costs, self.curvature, self.tried = list(costs), curvature, []
+
+    def evaluate(self, x, _):
+        self.tried.append(float(x[0]))
+        return Point(x, self.costs.pop(0), 50.0, np.empty(0), [])
+
+    def gradient(self, point):
+        return point.x.copy()
+
+    def matrix(self, _):
+        return np.array([[self.curvature]], order="F"), np.empty((1, 0)), np.empty((0, 0))
+
+
+@pytest.mark.parametrize("wild", [np.nan, np.inf, 60.0])
+def test_a_trial_without_a_lower_cost_is_refused_and_a_shorter_one_tried(wild):
+    fake = Fake(50.0, wild, wild, 1.0)
+    descent = BandedDescent(fake, np.array([10.0]), ())
+    descent.iterate()
+    assert descent.cost == 1.0
+    assert descent.damping == pytest.approx(1e-2)  # two refusals up, one success down
+    np.testing.assert_allclose(
+        fake.tried, [10.0] + [10.0 - 10.0 / (1 + k) for k in (1e-3, 1e-2, 0.1)]
+    )
+
+
+def test_a_step_must_keep_a_thousandth_of_its_promise():
+    """It promises to lower the cost by nearly 50."""
+    fake = Fake(50.0, 50.0 - 0.04, 50.0 - 0.06)
+    descent = BandedDescent(fake, np.array([10.0]), ())
+    descent.iterate()
+    assert descent.cost == pytest.approx(50.0 - 0.06)
+
+
+def test_a_refused_step_that_hardly_changes_the_cost_ends_the_iteration():
+    fake = Fake(50.0, 50.0 + 1e-9)
+    descent = BandedDescent(fake, np.array([10.0]), ())
+    descent.iterate()
+    assert (descent.cost, descent.damping) == (50.0, 1e-3)
+
+
+def test_lambda_has_an_end():
+    fake = Fake(50.0, *[np.nan] * 40)
+    descent = BandedDescent(fake, np.array([10.0]), ())
+    descent.iterate()
+    assert descent.cost == 50.0
+    assert descent.damping == pytest.approx(LARGEST_LAMBDA)
+    assert descent.gain() == pytest.approx(50.0)
+
+
+def test_where_the_factorisation_fails_lambda_grows():
+    fake = Fake(50.0, 1.0, curvature=-0.5)
+    descent = BandedDescent(fake, np.array([10.0]), ())
+    descent.iterate()
+    assert descent.cost == 1.0
+    assert descent.damping == pytest.approx(0.1)  # 1 is the first that outweighs the curvature
 
 
 def test_a_matrix_that_is_not_positive_definite_is_refused():
@@ -442,6 +503,60 @@ def test_a_better_answer_of_gtsam_is_taken(monkeypatch):
     np.testing.assert_allclose(found.trajectory.position, right.trajectory.position, atol=1e-4)
 
 
+def test_a_scout_that_does_not_see_all_is_found_out(monkeypatch):
+    """A fault in the scout: half of the pings count for nothing, in its cost as well."""
+
+    class Blind(BandedEngine):
+        def begin(self, x, frozen):
+            wide = tuple(
+                None if f is None else np.where(np.arange(len(f)) % 2, f, 1e3 * f) for f in frozen
+            )
+            return super().begin(x, wide)
+
+    mission, _ = straight_pass(3)
+    right = by(mission, "gtsam")
+    monkeypatch.setattr(ubl_graph.solve.choice, "BandedEngine", Blind)
+    found = smooth(mission)
+    assert found.segments[0].solver == "gtsam"
+    np.testing.assert_allclose(found.trajectory.position, right.trajectory.position, atol=1e-3)
+
+
+def test_an_engine_that_cannot_move_confirms_nothing():
+    problem, x = valley(50)
+    frozen = problem.frozen(x)
+    begin = BandedEngine(problem).begin(x, frozen)
+
+    class Stuck(GtsamEngine):
+        def begin(self, x, frozen):
+            descent = super().begin(x, frozen)
+
+            class Held:
+                cost, damping, gain = descent.cost, 1e10, descent.gain
+
+                def iterate(self):
+                    pass
+
+            return Held()
+
+    assert not confirms(Stuck(problem), Solution(x, frozen, begin.cost, 1, ""))
+    assert not confirms(GtsamEngine(problem), Solution(x, frozen, begin.cost, 1, ""))
+    solution = solve(BandedEngine(problem), x)
+    assert confirms(GtsamEngine(problem), solution)
+    assert confirms(Stuck(problem), solution)  # there is nothing to move for
+    assert not confirms(GtsamEngine(problem), replace(solution, cost=0.99 * solution.cost))
+
+
+def test_an_unconverged_answer_stands_as_it_is():
+    mission, _ = straight_pass(3, options=Options(max_iterations=2))
+    for solver in ("auto", "banded"):
+        (segment,) = by(mission, solver).segments
+        assert (segment.status, segment.iterations, segment.solver) == (
+            "not converged",
+            2,
+            "banded",
+        )
+
+
 def test_gtsam_failing_to_confirm_is_said_and_the_answer_stands(monkeypatch):
     class Failing(GtsamEngine):
         def begin(self, *_):
@@ -478,11 +593,11 @@ def test_a_wide_border_goes_to_gtsam_and_the_result_says_so(solver):
     assert "66 unknowns are shared by all nodes" in warning
 
 
-def test_a_wide_band_goes_to_gtsam_and_the_result_says_so(monkeypatch):
+@pytest.mark.parametrize("solver", ["auto", "gtsam", "banded"])
+def test_what_no_memory_holds_is_a_typed_error(monkeypatch, solver):
     monkeypatch.setattr(ubl_graph.solve.choice, "MOST_ENTRIES", 1000)
-    result = by(straight_pass()[0], "banded")
-    assert result.segments[0].solver == "gtsam"
-    assert any("a measurement spans" in w for w in result.warnings)
+    with pytest.raises(SolverError, match=r"nodes.* would take .* GB.*divide the segment"):
+        by(straight_pass()[0], solver)
 
 
 def test_up_to_the_limit_the_border_is_the_banded_solvers():
@@ -578,6 +693,22 @@ SINGULAR = {
         "along",
     ),
 }
+
+
+@pytest.mark.parametrize("motion", ["constant_velocity", "constant_acceleration"])
+@pytest.mark.parametrize("sigma", [1e-5, 1e-6, 1e-7, 1e-9])
+@pytest.mark.parametrize("name", ["unknown beacons", "over the beacon, DVL", "no start"])
+def test_what_rounding_hides_is_not_observed_either(name, sigma, motion):
+    """The more exact the pings, the fewer digits are left for what they do not tell."""
+    mission, _ = SINGULAR[name]
+    (segment,) = mission.segments
+    pings = replace(segment.two_way_range, sigma=np.full(len(segment.two_way_range), sigma))
+    options = replace(mission.options, motion=motion)
+    segment = replace(segment, two_way_range=pings)
+    for solver in ("gtsam", "banded"):
+        result = by(replace(mission, segments=(segment,), options=options), solver)
+        assert result.status == "unobservable"
+        assert np.isfinite(result.trajectory.covariance).all()
 
 
 @pytest.mark.parametrize("solver", ["gtsam", "banded"])

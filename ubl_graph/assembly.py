@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ubl_graph.arrays import FloatArray
+from ubl_graph.arrays import BoolArray, FloatArray
 from ubl_graph.factors.ranges import RangeBlock
 from ubl_graph.graph import SegmentModel
 from ubl_graph.layout import KINEMATIC, Chain
@@ -65,7 +65,8 @@ def assemble_segment(
     slow = {name: _slow_state(problem, solution, marginals, chain, name) for name, _ in layout.slow}
     residuals = _range_residuals(problem, solution, chain, model)
     limit = _unobserved_sigma(residuals, slow.get("clock_offset"))
-    status, reason = _status(solution, trajectory, limit, rival)
+    unresolved = marginals.unresolved[chain.nodes]
+    status, reason = _status(solution, trajectory, limit, unresolved, rival)
     chi_square, dof = _chi_square(problem, solution)
     return SegmentResult(
         chain.name,
@@ -144,15 +145,23 @@ def _unobserved_sigma(residuals: RangeResiduals | None, clock: SlowState | None)
 
 
 def _status(
-    solution: Solution, trajectory: Trajectory, limit: float, rival: str | None
+    solution: Solution,
+    trajectory: Trajectory,
+    limit: float,
+    unresolved: BoolArray,
+    rival: str | None,
 ) -> tuple[Status, str]:
     values, vectors = np.linalg.eigh(trajectory.covariance)
-    sigma = np.sqrt(values[:, -1])
-    if np.median(sigma) > limit:
-        node = int(np.argsort(sigma)[len(sigma) // 2])
+    sigma = np.sqrt(np.maximum(values[:, -1], 0.0))
+    open_ = unresolved | (sigma > limit)
+    if 2 * open_.sum() >= len(sigma):
+        # The middle one of those that are open.
+        nodes = np.flatnonzero(open_)
+        node = int(nodes[np.argsort(sigma[nodes])[len(nodes) // 2]])
+        rounding = ", which double precision does not resolve" if unresolved[node] else ""
         return "unobservable", (
             f"the data do not determine the track {direction(vectors[node, :, -1])} "
-            f"(standard deviation {sigma[node]:.0f} m at half of the nodes or more)"
+            f"(standard deviation {sigma[node]:.0f} m at half of the nodes or more{rounding})"
         )
     if rival is not None:
         return "unobservable", rival

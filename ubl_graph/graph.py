@@ -7,7 +7,7 @@ odometry, depth, fixes, ranges, slow states.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -22,7 +22,7 @@ from ubl_graph.factors.odometry import DVL_STATES, Preintegration, node_velocity
 from ubl_graph.factors.ranges import Legs, RangeBlock, TravelTimeModel
 from ubl_graph.layout import Chain, Interpolation, Layout
 from ubl_graph.measurements import OneWayRange, TwoWayRange
-from ubl_graph.mission import Mission, Segment
+from ubl_graph.mission import Mission, Segment, Start
 from ubl_graph.nodes import node_times, order_of
 from ubl_graph.options import Options
 from ubl_graph.problem import Problem
@@ -208,16 +208,21 @@ class _Builder:
                 self._node_prior("acceleration", first, np.zeros((1, 3)), FREE_ACCELERATION)
             )
         if segment.start is not None:
-            start = segment.start
-            node = np.array([chain.first + np.argmin(np.abs(chain.t - start.t))])
-            up = middle[2] if start.up is None else start.up
-            sigma = np.array([start.sigma, start.sigma, start.sigma])
-            if start.up is None:
-                sigma[2] = np.inf
-            mean = np.array([[start.east, start.north, up]])
-            columns = self.layout.node_columns("position", node)
-            blocks.append(linear.prior("start", columns, mean, sigma[None]))
+            blocks.append(self._start_block(chain, segment.start))
         return blocks
+
+    def _start_block(self, chain: Chain, start: Start) -> Block:
+        """The start prior: a fix of the reference point itself."""
+        position = self.layout.positions_at(chain, np.array([start.t]))
+        place = (
+            [start.east, start.north] if start.up is None else [start.east, start.north, start.up]
+        )
+        size = len(place)
+        variance = start.sigma**2 + self.psd[:size] * self._variance(position)
+        block = linear.position_fix(
+            position, np.zeros((1, 3)), np.array([place]), np.diag(variance)[None]
+        )
+        return replace(block, name="start prior")
 
     def _node_prior(
         self, name: str, nodes: IntArray, mean: FloatArray, sigma: float

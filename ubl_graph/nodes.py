@@ -19,8 +19,13 @@ NOMINAL_SPEED = 1500.0
 INTERPOLATION_SHARE = 0.1
 #: Without any measurement to ask for a node there is one at least every so many seconds.
 LONGEST_GAP = 10.0
-#: Stamps of one instant may differ by rounding: nodes nearer than this help nobody, s.
+#: Stamps of one instant may differ by rounding: times nearer than this are one, s.
 SAME_INSTANT = 1e-6
+#: Nodes stay apart by this share of the interval that the interpolation may span, by the prior's
+#: order. Nearer ones help nobody, and they know each other's place so much better than the data do
+#: (1e5 to 1e6 times at this distance, growing with its third or fifth power) that the normal
+#: equations lose the absolute place in rounding.
+LEAST_SHARE: dict[Order, float] = {2: 0.03, 3: 0.1}
 
 
 def order_of(options: Options) -> Order:
@@ -35,8 +40,8 @@ def node_times(
 
     A node stands at every transmit and receive time, at the start prior, where odometry begins
     and ends, and at the ends of the span of ranges, fixes and velocities; times so close that
-    the motion prior bridges them well under the range noise share nodes, and long gaps are
-    filled.
+    the motion prior bridges them well under the range noise share nodes, no two nodes are so close
+    that double precision cannot tell them from one, and long gaps are filled.
 
     Raises
     ------
@@ -51,14 +56,15 @@ def node_times(
             "are all times of one segment in the same epoch?",
         )
     psd = max(options.horizontal_psd, options.vertical_psd)
-    spacing = longest_interval(order_of(options), psd, INTERPOLATION_SHARE * min(sigmas))
+    order = order_of(options)
+    spacing = longest_interval(order, psd, INTERPOLATION_SHARE * min(sigmas))
     stay = np.zeros(len(wanted), dtype=np.bool_)
     after = np.searchsorted(wanted, kept).clip(1, max(len(wanted) - 1, 1))
     before = after - 1
     if len(wanted) > 1:
         nearer = kept - wanted[before] < wanted[after] - kept
         stay[np.where(nearer, before, after)] = True
-    return _filled(_thinned(wanted, stay, spacing))
+    return _filled(_thinned(wanted, stay, spacing, LEAST_SHARE[order] * spacing))
 
 
 def _candidates(
@@ -80,22 +86,32 @@ def _candidates(
         sigmas.append(float(np.sqrt(segment.position.covariances[:, 0, 0].min())))
     if segment.start is not None:
         wanted.append(np.array([segment.start.t]))
-        kept.append(wanted[-1])
     times = np.unique(np.concatenate(wanted))
     times = times[np.concatenate([[True], np.diff(times) > SAME_INSTANT])]
     return times, np.concatenate(kept) if kept else np.empty(0), sigmas
 
 
-def _thinned(times: FloatArray, must_stay: BoolArray, spacing: float) -> FloatArray:
-    """Leave out times whose neighbours are within `spacing` of each other."""
+def _thinned(times: FloatArray, must_stay: BoolArray, spacing: float, least: float) -> FloatArray:
+    """Leave out times whose neighbours are within `spacing` of each other, and any within `least`.
+
+    The ends stay in any case; of two times within `least` the one that must stay does, else the
+    earlier one.
+    """
     if len(times) < 3 or np.diff(times).min() > spacing:
         return times
-    chosen = [times[0]]
+    chosen, fixed = [times[0]], [True]
     for i in range(1, len(times) - 1):
-        if must_stay[i] or times[i + 1] - chosen[-1] > spacing:
-            chosen.append(times[i])
-    chosen.append(times[-1])
-    return np.array(chosen)
+        t = times[i]
+        if not must_stay[i] and times[i + 1] - chosen[-1] <= spacing:
+            continue
+        if t - chosen[-1] < least and must_stay[i] and not fixed[-1]:
+            chosen[-1], fixed[-1] = t, True
+        elif t - chosen[-1] >= least:
+            chosen.append(t)
+            fixed.append(bool(must_stay[i]))
+    if times[-1] - chosen[-1] < least and len(chosen) > 1:
+        chosen.pop()
+    return np.array([*chosen, times[-1]])
 
 
 def _filled(times: FloatArray) -> FloatArray:

@@ -111,8 +111,7 @@ class Options:
     solver: Solver = "auto"
     """GTSAM on the factor graph, or the banded normal equations; both take the same steps to the
     same answer, the banded solver some 30 times faster. Auto solves on the fast path and has GTSAM
-    confirm the answer up to 5 000 nodes; what the banded solver does not take (many shared
-    unknowns) GTSAM solves alone."""
+    confirm the answer up to 5 000 nodes; more than 64 shared unknowns GTSAM solves alone."""
 
     max_iterations: int = 100
     """Levenberg-Marquardt iterations after which a solve counts as not converged."""

@@ -239,7 +239,7 @@ class MissionTrajectory:
         return np.concatenate([s.trajectory.covariance for s in self._segments])
 
     def at(self, times: FloatArray | Sequence[float] | float) -> States:
-        """Position, velocity and position covariance at `times` (M,), s.
+        """Position and velocity with their covariances at `times` (M,), s.
 
         Raises
         ------
@@ -247,6 +247,8 @@ class MissionTrajectory:
             Where a time lies in no segment, or in several (ask one of them by name instead).
         """
         times = np.atleast_1d(np.asarray(times, dtype=np.float64))
+        if times.ndim != 1:
+            raise TimeError(f"times have {times.ndim} dimensions; give one time or a list of them")
         tracks = [s.trajectory for s in self._segments]
         holds = np.stack([(times >= track.t[0]) & (times <= track.t[-1]) for track in tracks])
         count = holds.sum(axis=0)

@@ -28,6 +28,8 @@ from ubl_graph.track import Track, mirror_images, place, track_of, unanchored
 
 #: A second track counts as no worse where its cost is higher by less than this: odds of 20 to 1.
 AMBIGUOUS_COST = 3.0
+#: Costs nearer than this are equal: two engines, or machines, round differently.
+SAME_COST = 1e-6
 #: A second track nearer than so many standard deviations is the same flat valley, not a rival.
 COVERED_SIGMAS = 3.0
 #: Where more pings than this are down-weighted, a graduated solve is tried as well.
@@ -201,17 +203,19 @@ def _solve_from(
             rivals += mirror_images(work.mission, group[0], found)
         starts_at = [_vector(work.mission, problem, [track]) for track in rivals]
         solutions += [work.solve(engine, x) for x in starts_at]
-    best, *others = sorted(solutions, key=lambda s: s.cost)
-    return best, others
+    # Mirror images cost the same but for rounding: of equals the first stays the answer.
+    least = min(s.cost for s in solutions)
+    best = next(s for s in solutions if s.cost <= least + SAME_COST)
+    return best, [s for s in solutions if s is not best]
 
 
 def _confirmed(work: _Work, choice: Choice, found: Solution) -> tuple[Solution, str]:
     """The scout's answer, shown to the other engine; the one that counts, and who gave it."""
     scout, last = choice.scout, choice.last
-    if last is scout:
+    if last is scout or not found.converged:
         return found, scout.name
     try:
-        if found.converged and confirms(last, found):
+        if confirms(last, found):
             return found, f"{scout.name}, confirmed by {last.name}"
         again = work.solve(last, found.x)
     except SolverError as error:

@@ -228,7 +228,7 @@ class Trajectory:
         return 2 if self.acceleration is None else 3
 
     def at(self, times: ArrayLike) -> States:
-        """Position, velocity and position covariance at any times of the trajectory's span.
+        """Position and velocity with their covariances at any times of the trajectory's span.
 
         Parameters
         ----------
@@ -246,9 +246,11 @@ class Trajectory:
         Raises
         ------
         TimeError
-            Where a time is not finite or outside the span.
+            Where a time is not finite or outside the span, or `times` has two dimensions.
         """
         times = np.atleast_1d(np.asarray(times, dtype=np.float64))
+        if times.ndim != 1:
+            raise TimeError(f"times have {times.ndim} dimensions; give one time or a list of them")
         outside = ~((times >= self.t[0]) & (times <= self.t[-1]))
         if outside.any():
             raise TimeError(

@@ -19,6 +19,7 @@ from ubl_graph.solve.rounds import (
     LARGEST_LAMBDA,
     LEAST_FIDELITY,
     RELATIVE_DECREASE,
+    best_gain,
 )
 
 _pbtrf, _pbtrs, _tbtrs, _potrf, _potrs = get_lapack_funcs(
@@ -41,7 +42,7 @@ class BandedFactor:
     Attributes
     ----------
     band : array, shape (reach, inner)
-        L of the band, A = L L'.
+        L of the band, A = L L', in the memory that `band` came in.
     coupling : array, shape (inner, border)
         L^-1 C.
     corner : array, shape (border, border)
@@ -123,13 +124,19 @@ class BandedDescent:
 
     def __init__(self, equations: NormalEquations, x: FloatArray, frozen: Frozen) -> None:
         self._equations, self._frozen = equations, frozen
-        self._point = equations.evaluate(x, frozen)
+        self._point = equations.evaluate(x.copy(), frozen)
         self.damping = INITIAL_LAMBDA
 
     @property
     def cost(self) -> float:
         """Sum of the losses where it is."""
         return self._point.cost
+
+    def gain(self) -> float:
+        """What the best move of a single unknown would lower the cost by, linearised."""
+        band, _, corner = self._equations.matrix(self._point)
+        curvature = np.concatenate([band[0], corner.diagonal()])
+        return best_gain(self._equations.gradient(self._point), curvature)
 
     def vector(self) -> FloatArray:
         """The flat vector where it is."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ubl_graph.errors import SolverError
 from ubl_graph.options import Solver
 from ubl_graph.problem import Problem
 from ubl_graph.solve.banded import BandedEngine
@@ -15,7 +16,8 @@ from ubl_graph.solve.rounds import Engine
 GTSAM_NODES = 5000
 #: Shared unknowns that the banded solver takes: its border is dense, each one costs a solve.
 MOST_SHARED = 64
-#: Entries of the band that it takes: 2 GB.
+#: Entries of the band that fit: 2 GB, and as much again several times over for the solution. The
+#: covariances need it whatever solves the problem.
 MOST_ENTRIES = 1 << 28
 
 
@@ -53,26 +55,33 @@ def choose(problem: Problem, solver: Solver) -> Choice:
     Returns
     -------
     Choice
+
+    Raises
+    ------
+    SolverError
+        Where the problem is too large for the memory of any ordinary machine.
     """
-    reason = "" if solver == "gtsam" else not_banded(problem)
-    if solver == "gtsam" or reason:
-        engine = GtsamEngine(problem)
-        note = f"GTSAM solves it, not the banded solver: {reason}" if reason else ""
-        return Choice(engine, engine, note)
+    shape = shape_of(problem)
+    if shape.band_size > MOST_ENTRIES:
+        joined = shape.reach // problem.layout.node_width
+        raise SolverError(
+            f"{problem.layout.node_count} nodes, of which single measurements join {joined} in a "
+            f"row, would take {8e-9 * shape.band_size:.1f} GB for the normal equations alone",
+            "divide the segment",
+        )
+    if solver == "gtsam":
+        return _alone(GtsamEngine(problem))
+    if shape.border > MOST_SHARED:
+        return _alone(
+            GtsamEngine(problem),
+            f"GTSAM solves it, not the banded solver: {shape.border} unknowns are shared by all "
+            f"nodes, more than {MOST_SHARED}",
+        )
     banded = BandedEngine(problem)
     if solver == "auto" and problem.layout.node_count <= GTSAM_NODES:
         return Choice(banded, GtsamEngine(problem))
-    return Choice(banded, banded)
+    return _alone(banded)
 
 
-def not_banded(problem: Problem) -> str:
-    """Why the banded solver does not take a problem; empty where it does."""
-    shape = shape_of(problem)
-    if shape.border > MOST_SHARED:
-        return f"{shape.border} unknowns are shared by all nodes, more than {MOST_SHARED}"
-    if shape.size > MOST_ENTRIES:
-        return (
-            f"a measurement spans {shape.reach // problem.layout.node_width} nodes, which would "
-            f"take {8e-9 * shape.size:.1f} GB"
-        )
-    return ""
+def _alone(engine: Engine, note: str = "") -> Choice:
+    return Choice(engine, engine, note)

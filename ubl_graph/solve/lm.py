@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gtsam
+from scipy import sparse
 
 from ubl_graph.arrays import FloatArray
 from ubl_graph.errors import SolverError
@@ -13,6 +14,7 @@ from ubl_graph.solve.rounds import (
     LAMBDA_FACTOR,
     LARGEST_LAMBDA,
     RELATIVE_DECREASE,
+    best_gain,
 )
 
 
@@ -62,9 +64,10 @@ class GtsamDescent:
 
     def __init__(self, view: GraphView, x: FloatArray, frozen: Frozen) -> None:
         self._view = view
+        self._graph = view.graph(frozen)
         try:
             self._optimizer = gtsam.LevenbergMarquardtOptimizer(
-                view.graph(frozen), view.values(x), _parameters(view)
+                self._graph, view.values(x), _parameters(view)
             )
         except RuntimeError as error:
             raise _gave_up(error) from error
@@ -85,6 +88,16 @@ class GtsamDescent:
             self._optimizer.iterate()
         except RuntimeError as error:
             raise _gave_up(error) from error
+
+    def gain(self) -> float:
+        """What the best move of a single unknown would lower the cost by, linearised."""
+        linear = self._graph.linearize(self._optimizer.values())
+        row, column, value = linear.sparseJacobian_()
+        # Counted from one; the last column is the right-hand side.
+        system = sparse.csc_array((value, (row.astype(int) - 1, column.astype(int) - 1)))
+        jacobian, right = system[:, :-1], system[:, [-1]].toarray()[:, 0]
+        curvature = jacobian.power(2).sum(axis=0).ravel()
+        return best_gain(jacobian.T @ right, curvature)
 
     def vector(self) -> FloatArray:
         """The flat vector where it is."""

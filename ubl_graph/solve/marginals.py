@@ -21,10 +21,11 @@ is a border: Schur's complement adds its part.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from ubl_graph.arrays import FloatArray, IntArray
+from ubl_graph.arrays import BoolArray, FloatArray, IntArray
 from ubl_graph.errors import SolverError
 from ubl_graph.problem import Problem
 from ubl_graph.solve.banded import BandedFactor
@@ -33,9 +34,13 @@ from ubl_graph.solve.rounds import Solution
 
 #: Shares of the diagonal added where the normal equations are singular to rounding. What only a
 #: prior of 1e5 m holds beside a sensor of centimetres is at the edge of what double precision
-#: resolves. A ridge of rounding's size then lets the factorisation pass; it cuts standard
-#: deviations that only say "not observed" anyway.
-RIDGES = (0.0, 1e-14, 1e-13, 1e-12, 1e-11)
+#: resolves. A ridge of rounding's size then lets the factorisation pass; `unresolved` says which
+#: covariances are its doing.
+RIDGES = (0.0, *(10.0**k for k in range(-14, -7)))
+#: Where a pivot is below this share of its diagonal, rounding may have made it.
+DOUBTFUL_PIVOT = 1e-12
+#: More columns in reach than this are not worth composing steps for: it takes their cube.
+MOST_COMPOSED = 64
 #: Nodes whose blocks are read off the factor at once: what fits the cache.
 AT_ONCE = 4096
 
@@ -50,28 +55,32 @@ class Marginals:
     solution : Solution
         Where it ended.
 
+    Attributes
+    ----------
+    unresolved : array of bool, shape (N,)
+        Nodes whose position varies so much more than their neighbours hold them that double
+        precision does not tell how much: the data do not determine it.
+
     Raises
     ------
     SolverError
-        Where the normal equations are singular or not finite.
+        Where the normal equations are not finite or an unknown enters no residual.
     """
 
     def __init__(self, problem: Problem, solution: Solution) -> None:
         self._layout = layout = problem.layout
         equations = NormalEquations(problem)
         point = equations.evaluate(solution.x, solution.frozen)
-        factor, self._scale = _scaled_factor(equations, point)
-        node, following = selected_inverse(factor.band, layout.node_width)
-        self._shared = np.empty((0, 0))
-        if len(factor.corner):
-            # The columns of A^-1 C say how much of each shared unknown's error a node takes over.
-            share = factor.solve_transposed(factor.coupling)
-            share = share.reshape(-1, layout.node_width, len(factor.corner))
-            self._shared = factor.inverse_corner()
-            taken = share @ self._shared
-            node += taken @ np.swapaxes(share, 1, 2)
-            following += taken[:-1] @ np.swapaxes(share[1:], 1, 2)
-        self._node, self._following = node, following
+        found = _invert(equations, point, RIDGES)
+        self._scale, self._shared = found.scale, found.shared
+        self._node, self._following = found.node, found.following
+        self.unresolved: BoolArray = np.zeros(layout.node_count, dtype=np.bool_)
+        if found.doubtful:
+            # What a larger ridge lowers, the ridge has made, or rounding has.
+            own = np.arange(3)
+            ridges = [r for r in RIDGES if r >= max(10.0 * found.ridge, DOUBTFUL_PIVOT)]
+            larger = _invert(equations, point, ridges).node[:, own, own].sum(axis=1)
+            self.unresolved = larger < 0.5 * found.node[:, own, own].sum(axis=1)
 
     def of(self, name: str) -> FloatArray:
         """Covariance of a quantity, SI: (N, size, size) per node, (size, size) if shared."""
@@ -109,9 +118,42 @@ class Marginals:
         return columns[0], self._scale[columns] * units
 
 
-def _scaled_factor(equations: NormalEquations, point: Point) -> tuple[BandedFactor, FloatArray]:
-    """Factor of the normal matrix scaled to unit diagonal, and the columns' scale."""
-    for ridge in RIDGES:
+@dataclass(frozen=True, eq=False)
+class _Inverse:
+    """Blocks of the scaled inverse, and how far to trust them."""
+
+    node: FloatArray
+    following: FloatArray
+    shared: FloatArray
+    scale: FloatArray
+    ridge: float
+    doubtful: bool
+
+
+def _invert(equations: NormalEquations, point: Point, ridges: Sequence[float]) -> _Inverse:
+    """Invert with the first ridge that lets the factorisation pass."""
+    factor, scale, ridge = _scaled_factor(equations, point, ridges)
+    width = equations.problem.layout.node_width
+    node, following = selected_inverse(factor.band, width)
+    shared = np.empty((0, 0))
+    pivots = factor.band[0]
+    if len(factor.corner):
+        # The columns of A^-1 C say how much of each shared unknown's error a node takes over.
+        share = factor.solve_transposed(factor.coupling).reshape(-1, width, len(factor.corner))
+        shared = factor.inverse_corner()
+        taken = share @ shared
+        node += taken @ np.swapaxes(share, 1, 2)
+        following += taken[:-1] @ np.swapaxes(share[1:], 1, 2)
+        pivots = np.append(pivots, factor.corner.diagonal())
+    doubtful = ridge > 0.0 or float(pivots.min()) ** 2 < DOUBTFUL_PIVOT
+    return _Inverse(node, following, shared, scale, ridge, doubtful)
+
+
+def _scaled_factor(
+    equations: NormalEquations, point: Point, ridges: Sequence[float]
+) -> tuple[BandedFactor, FloatArray, float]:
+    """Factor of the normal matrix scaled to unit diagonal, the columns' scale, and the ridge."""
+    for ridge in ridges:
         band, coupling, corner = equations.matrix(point)
         diagonal = np.concatenate([band[0], corner.diagonal()])
         if not np.isfinite(diagonal).all() or (diagonal <= 0.0).any():
@@ -123,8 +165,9 @@ def _scaled_factor(equations: NormalEquations, point: Point) -> tuple[BandedFact
         coupling *= scale[:inner, None] * scale[inner:]
         corner *= scale[inner:, None] * scale[inner:]
         band[0] += ridge
+        corner[np.diag_indices_from(corner)] += ridge
         try:
-            return BandedFactor(band, coupling, corner), scale
+            return BandedFactor(band, coupling, corner), scale, ridge
         except np.linalg.LinAlgError:
             continue
     raise SolverError("the covariances cannot be computed: the normal equations are singular")
@@ -148,14 +191,16 @@ def selected_inverse(factor: FloatArray, width: int) -> tuple[FloatArray, FloatA
         Covariance of each node (rows) with the next one (columns).
     """
     count = factor.shape[1] // width
-    length = max(1, round(np.sqrt(count / 2.0)))
+    composed = factor.shape[0] <= MOST_COMPOSED
+    length = max(1, round(np.sqrt(count / 2.0))) if composed else count
     pieces = -(-count // length)
     # Nodes that only fill up the first piece stand before all others and change nothing.
     extra = pieces * length - count
     gain, noise = (
         blocks.reshape(pieces, length, width, -1) for blocks in _backward(factor, width, extra)
     )
-    beyond = _carried(*_composed(gain, noise))
+    size = gain.shape[-1]
+    beyond = _carried(*_composed(gain, noise)) if composed else np.zeros((1, size, size))
     # Each node's own covariance takes the place of its noise, which is not needed any more.
     node, following = noise, np.empty_like(noise)
     for k in range(length - 1, -1, -1):

@@ -56,6 +56,10 @@ class Descent(Protocol):
         """Take one step, or none where no lambda lowers the cost."""
         ...
 
+    def gain(self) -> float:
+        """What the best move of a single unknown would lower the cost by, linearised."""
+        ...
+
     def vector(self) -> FloatArray:
         """The flat vector where it is."""
         ...
@@ -152,7 +156,9 @@ def at_rest(before: float, after: float) -> bool:
 
 
 def confirms(engine: Engine, solution: Solution) -> bool:
-    """Whether an engine, begun at another's solution, finds nothing better.
+    """Whether an engine, begun at another's solution, sees the same cost and finds nothing better.
+
+    It takes one iteration; what the other engine says of its cost is checked, not believed.
 
     Parameters
     ----------
@@ -167,8 +173,10 @@ def confirms(engine: Engine, solution: Solution) -> bool:
         Where the engine gives up.
     """
     descent = engine.begin(solution.x, solution.frozen)
+    cost = descent.cost
     descent.iterate()
-    return at_rest(solution.cost, descent.cost)
+    same = at_rest(max(cost, solution.cost), min(cost, solution.cost))
+    return same and at_rest(cost, descent.cost) and not _exhausted(descent)
 
 
 def graduated(engine: Engine, x: FloatArray) -> FloatArray:
@@ -232,9 +240,24 @@ def _descend(
         if progress is not None:
             progress(before + done, cost)
         if at_rest(previous, cost):
-            exhausted = descent.damping >= LARGEST_LAMBDA and cost > ABSOLUTE_DECREASE
-            return cost, done, "no step lowers the cost, however damped" if exhausted else ""
+            trouble = "no step lowers the cost, however damped" if _exhausted(descent) else ""
+            return cost, done, trouble
     return cost, most, f"the cost did not come to rest in {most} iterations (max_iterations)"
+
+
+def best_gain(slope: FloatArray, curvature: FloatArray) -> float:
+    """`Descent.gain` from the cost's gradient and the diagonal of its Hessian."""
+    return 0.5 * float(np.max(slope**2 / np.maximum(curvature, np.finfo(float).tiny)))
+
+
+def _exhausted(descent: Descent) -> bool:
+    """Whether no lambda helped although there is something to gain.
+
+    At a minimum to rounding no lambda helps either, and nothing is amiss.
+    """
+    if descent.damping < LARGEST_LAMBDA:
+        return False
+    return not at_rest(descent.cost, descent.cost - descent.gain())
 
 
 def _change(before: Frozen, after: Frozen) -> float:
