@@ -339,6 +339,9 @@ def main(arguments: Sequence[str] | None = None, plan: Plan | None = None) -> in
     if given.scaling_row:
         print(json.dumps(problems.scaling_row(*given.scaling_row)))
         return 0
+    for path in (given.json, given.figure):
+        if path and not path.resolve().parent.is_dir():
+            parser.error(f"{path}: there is no such folder; make it first")
     report, pairs = measure(plan or (QUICK if given.quick else FULL))
     show(report, pairs)
     failed = disagreements(pairs)

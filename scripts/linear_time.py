@@ -1,7 +1,7 @@
 """Show that Levenberg-Marquardt stays linear in the nodes with factors written in Python.
 
-Grows a chain of constant-velocity nodes, one a second, each with one two-way ping along straight
-rays, and times the solver over the same number of iterations for
+Grows the benchmark's simple problem, a chain of constant-velocity nodes each with one two-way ping
+along straight rays, and times GTSAM's optimiser over the same number of iterations for
 
 - ours: the range residual as a wrapped custom factor, as `smooth` builds it;
 - native: the same chain with GTSAM's own C++ RangeFactor3 (one-way at the node, beacon as a key).
@@ -20,92 +20,21 @@ import sys
 import time
 from pathlib import Path
 
-import gtsam
+import benchmark_problems as problems
+import benchmark_rivals as rivals
 import numpy as np
 
-from ubl_graph import Beacon, Mission, Options, Segment, SoundSpeedProfile, TwoWayRange
-from ubl_graph.graph import build_problem, model_segment
-from ubl_graph.gtsam_view import GraphView
 
-SPEED = 1500.0
-ITERATIONS = 3
-#: So large that no node can be spared, m^2/s^3.
-PSD = 2e-2
-BEACONS = tuple(
-    Beacon(f"B{i}", [800.0 * np.cos(a), 800.0 * np.sin(a), -500.0])
-    for i, a in enumerate(np.arange(3) * 2.0 * np.pi / 3.0)
-)
-
-
-def position(t: np.ndarray) -> np.ndarray:
-    """A wide circle at 1 m/s."""
-    return np.stack(
-        [300.0 * np.sin(t / 300.0), 300.0 * np.cos(t / 300.0), -10.0 + 0.0 * t], axis=-1
-    )
-
-
-def two_way_mission(nodes: int, rng: np.random.Generator) -> Mission:
-    """One ping a node: sent at one, its reply heard two nodes later."""
-    t = np.arange(float(nodes - 2))
-    which = np.arange(len(t)) % 3
-    receive = t + 2.0
-    sites = np.array([BEACONS[i].position for i in which])
-    out = np.linalg.norm(position(t) - sites, axis=1)
-    back = np.linalg.norm(position(receive) - sites, axis=1)
-    travel = (out + back) / SPEED + 1e-4 * rng.normal(size=len(t))
-    names = [BEACONS[i].name for i in which]
-    pings = TwoWayRange(names, t, receive, travel, 1e-4)
-    options = Options(estimate_sound_speed=False, loss="none", acceleration_psd=PSD)
-    return Mission(
-        (Segment("", pings),), BEACONS, SoundSpeedProfile.constant(SPEED), options=options
-    )
-
-
-def ours(nodes: int, rng: np.random.Generator) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+def ours(nodes: int) -> rivals.GraphCase:
     """Graph and start as `smooth` would build them."""
-    mission = two_way_mission(nodes, rng)
-    problem = build_problem(mission, [model_segment(mission.segments[0], mission.options)])
-    x = np.zeros(problem.layout.size)
-    t = problem.layout.chains[0].t
-    assert len(t) == nodes
-    problem.layout.put(x, "position", position(t) + rng.normal(size=(len(t), 3)))
-    view = GraphView(problem)
-    return view.graph(problem.frozen(x)), view.values(x)
+    case = problems.simple(nodes)
+    return rivals.wrapped(case, case.start, case.problem.frozen(case.start))
 
 
-def native(nodes: int, rng: np.random.Generator) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """The same chain with GTSAM's own factors."""
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    x, v, b = (gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.V, gtsam.symbol_shorthand.B)
-    tight = gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)
-    for j, beacon in enumerate(BEACONS):
-        values.insert(b(j), np.array(beacon.position))
-        graph.add(gtsam.PriorFactorPoint3(b(j), np.array(beacon.position), tight))
-    wide = gtsam.noiseModel.Isotropic.Sigma(3, 10.0)
-    noise = gtsam.noiseModel.Isotropic.Sigma(1, 0.075)
-    psd = np.full(3, PSD)
-    graph.add(gtsam.PriorFactorVector(v(0), np.zeros(3), wide))
-    places = position(np.arange(float(nodes)))
-    for k, place in enumerate(places):
-        values.insert(x(k), place + rng.normal(size=3))
-        values.insert(v(k), np.zeros(3))
-        j = k % 3
-        measured = np.linalg.norm(place - BEACONS[j].position) + 0.075 * rng.normal()
-        graph.add(gtsam.RangeFactor3(x(k), b(j), measured, noise))
-        if k:
-            ends = [gtsam.StateData(x(i), v(i), float(i)) for i in (k - 1, k)]
-            graph.add(gtsam.WnoaMotionFactorPoint3(*ends, psd))
-    return graph, values
-
-
-def solve_seconds(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> float:
+def solve_seconds(case: rivals.GraphCase) -> float:
     """Time of a fixed number of LM iterations, ordering included."""
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setlambdaInitial(1e-3)
     begin = time.perf_counter()
-    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
-    for _ in range(ITERATIONS):
-        optimizer.iterate()
+    case.iterate()
     return time.perf_counter() - begin
 
 
@@ -122,11 +51,8 @@ def main() -> int:
         f"{'nodes':>7} {'ours, s':>9} {'native, s':>10} {'ours us/node':>13} {'native us/node':>15}"
     )
     for nodes in arguments.nodes:
-        made = {
-            "ours": ours(nodes, np.random.default_rng(1)),
-            "native": native(nodes, np.random.default_rng(1)),
-        }
-        runs = [{k: solve_seconds(*v) for k, v in made.items()} for _ in range(arguments.repeats)]
+        made = {"ours": ours(nodes), "native": rivals.native(nodes)}
+        runs = [{k: solve_seconds(v) for k, v in made.items()} for _ in range(arguments.repeats)]
         median = {k: float(np.median([run[k] for run in runs])) for k in made}
         row = {"nodes": nodes, "ours_s": median["ours"], "native_s": median["native"]}
         rows.append(row)

@@ -66,6 +66,13 @@ def test_the_script_writes_what_it_promises(tmp_path, capsys):
     assert all(title in table for title in script.TITLES.values())
 
 
+def test_a_folder_that_is_not_there_is_said_at_once(tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        script.main(["--json", str(tmp_path / "none" / "ratios.json")], TINY)
+    assert stop.value.code == 2
+    assert "there is no such folder" in capsys.readouterr().err
+
+
 def test_answers_that_differ_fail_the_run(monkeypatch, capsys):
     right = rivals.positions
     monkeypatch.setattr(rivals, "positions", lambda *a: right(*a) + np.array([0.0, 0.0, 2e-6]))
