@@ -78,8 +78,8 @@ class Marginals:
         if found.doubtful:
             # What a larger ridge lowers, the ridge has made, or rounding has.
             own = np.arange(3)
-            ridges = [r for r in RIDGES if r >= max(10.0 * found.ridge, DOUBTFUL_PIVOT)]
-            larger = _invert(equations, point, ridges).node[:, own, own].sum(axis=1)
+            ridge = max(10.0 * found.ridge, DOUBTFUL_PIVOT)
+            larger = _invert(equations, point, [ridge]).node[:, own, own].sum(axis=1)
             self.unresolved = larger < 0.5 * found.node[:, own, own].sum(axis=1)
 
     def of(self, name: str) -> FloatArray:
