@@ -34,7 +34,7 @@ from ubl_graph.arrays import FloatArray
 from ubl_graph.gtsam_view import GraphView
 from ubl_graph.problem import Frozen
 from ubl_graph.solve.banded import BandedDescent, BandedEngine
-from ubl_graph.solve.lm import _parameters
+from ubl_graph.solve.lm import parameters_of
 from ubl_graph.solve.rounds import INITIAL_LAMBDA, solve
 
 #: At which scipy stops, and to which its linear solver works; looser ones leave its answer 0.1 mm
@@ -77,7 +77,7 @@ class GraphCase:
 def wrapped(case: Case, x: FloatArray, frozen: Frozen) -> GraphCase:
     """The problem's own graph, its range rows wrapped, as the library hands it to GTSAM."""
     view = GraphView(case.problem)
-    return GraphCase(view.graph(frozen), view.values(x), _parameters(view))
+    return GraphCase(view.graph(frozen), view.values(x), parameters_of(view))
 
 
 def plain(case: Case) -> GraphCase:

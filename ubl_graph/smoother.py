@@ -162,10 +162,10 @@ def _solved(
 ) -> tuple[Solution, list[Solution], str]:
     """The best solution, the others that were found, and who solved it."""
     choice = choose(problem, work.mission.options.solver)
-    if choice.note:
-        work.warn(group[0].segment.name if len(group) == 1 else "", choice.note)
     best, others = _solve_from(work, choice.scout, group, starts)
-    best, solver = _confirmed(work, choice, best)
+    best, solver, note = _confirmed(work, choice, best)
+    for text in filter(None, (choice.note, note)):
+        work.warn(group[0].segment.name if len(group) == 1 else "", text)
     return best, others, solver
 
 
@@ -188,7 +188,7 @@ def _solve_from(
 ) -> tuple[Solution, list[Solution]]:
     """Solve from the best start, and from its rivals and mirror images in a single segment.
 
-    Returns the cheapest solution, and the others.
+    Returns the cheapest solution, and the others, cheapest first.
     """
     problem = engine.problem
     begin = _vector(work.mission, problem, [s.tracks[0] for s in starts])
@@ -206,22 +206,25 @@ def _solve_from(
     # Mirror images cost the same but for rounding: of equals the first stays the answer.
     least = min(s.cost for s in solutions)
     best = next(s for s in solutions if s.cost <= least + SAME_COST)
-    return best, [s for s in solutions if s is not best]
+    return best, sorted((s for s in solutions if s is not best), key=lambda s: s.cost)
 
 
-def _confirmed(work: _Work, choice: Choice, found: Solution) -> tuple[Solution, str]:
-    """The scout's answer, shown to the other engine; the one that counts, and who gave it."""
+def _confirmed(work: _Work, choice: Choice, found: Solution) -> tuple[Solution, str, str]:
+    """The scout's answer, shown to the other engine.
+
+    Returns the answer that counts, who gave it, and what a user should know of that.
+    """
     scout, last = choice.scout, choice.last
     if last is scout or not found.converged:
-        return found, scout.name
+        return found, scout.name, ""
     try:
         if confirms(last, found):
-            return found, f"{scout.name}, confirmed by {last.name}"
+            return found, f"{scout.name}, confirmed by {last.name}", ""
         again = work.solve(last, found.x)
     except SolverError as error:
-        work.warn("", f"{last.name} could not confirm the answer of {scout.name}: {error}")
-        return found, scout.name
-    return replace(again, iterations=found.iterations + again.iterations), last.name
+        note = f"{last.name} could not confirm the answer of {scout.name}: {error}"
+        return found, scout.name, note
+    return replace(again, iterations=found.iterations + again.iterations), last.name, ""
 
 
 def _down_weighted(problem: Problem, solution: Solution) -> float:
@@ -243,7 +246,7 @@ def _rival(
     for other in others:
         gap = problem.layout.get(best.x, "position") - problem.layout.get(other.x, "position")
         apart = float(np.sqrt(np.mean(np.sum(gap**2, axis=1))))
-        extra = other.cost - best.cost
+        extra = max(other.cost - best.cost, 0.0)
         if apart > covered and extra < AMBIGUOUS_COST:
             return (
                 f"ambiguous: another track, {apart:.0f} m away (rms, mostly "

@@ -257,11 +257,8 @@ class _System:
         total = times[..., 0] + times[..., 1]
         residual = (total + s.clock * theta[:, CLOCK, None] - s.measured) * self.inverse
         jacobian = np.empty((n_starts, m, PARAMETERS))
-        for columns, factor in (
-            (EAST_NORTH_UP, np.ones_like(self.dt)),
-            (VELOCITY, self.dt),
-            (ACCELERATION, self.bend),
-        ):
+        jacobian[..., EAST_NORTH_UP] = slopes[..., 0, :] + slopes[..., 1, :]
+        for columns, factor in ((VELOCITY, self.dt), (ACCELERATION, self.bend)):
             legs = slopes * factor[..., None]
             jacobian[..., columns] = legs[..., 0, :] + legs[..., 1, :]
         jacobian[..., SCALE] = total

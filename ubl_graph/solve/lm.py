@@ -67,7 +67,7 @@ class GtsamDescent:
         self._graph = view.graph(frozen)
         try:
             self._optimizer = gtsam.LevenbergMarquardtOptimizer(
-                self._graph, view.values(x), _parameters(view)
+                self._graph, view.values(x), parameters_of(view)
             )
         except RuntimeError as error:
             raise _gave_up(error) from error
@@ -108,7 +108,8 @@ def _gave_up(error: RuntimeError) -> SolverError:
     return SolverError(f"GTSAM gave up: {' '.join(str(error).split())[:200]}")
 
 
-def _parameters(view: GraphView) -> gtsam.LevenbergMarquardtParams:
+def parameters_of(view: GraphView) -> gtsam.LevenbergMarquardtParams:
+    """What the optimiser is run with: the common schedule, elimination along the chain."""
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setlambdaInitial(INITIAL_LAMBDA)
     parameters.setlambdaFactor(LAMBDA_FACTOR)

@@ -293,6 +293,8 @@ class _LinearRows:
 
     Attributes
     ----------
+    target : array, shape (M R,)
+        Right-hand sides.
     columns : array of int, shape (M, C)
         The block's.
     rows, places : array of int, shape (E,)
