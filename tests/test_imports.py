@@ -40,6 +40,7 @@ ORDER = [
     "sim/",
     "plots",
     "io/",
+    "online/",
     "cli",
     "__main__",
 ]

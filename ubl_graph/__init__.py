@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     )
     from ubl_graph.evaluation import Errors, evaluate
     from ubl_graph.frames import GeodeticOrigin, LeverArm
-    from ubl_graph.io.mission_file import load_mission
+    from ubl_graph.io.mission_file import load_mission, load_setup
     from ubl_graph.measurements import (
         Attitude,
         Depth,
@@ -36,7 +36,9 @@ if TYPE_CHECKING:
         TwoWayRange,
         Velocity,
     )
-    from ubl_graph.mission import Mission, Reference, Segment, Start, Vehicle
+    from ubl_graph.mission import Mission, Reference, Segment, Setup, Start, Vehicle
+    from ubl_graph.online.estimator import FixedLagEstimator
+    from ubl_graph.online.outputs import Estimate, Event, Outcome
     from ubl_graph.options import Options
     from ubl_graph.result import Result
     from ubl_graph.smoother import smooth
@@ -57,7 +59,12 @@ _HOME = {
     "evaluate": "evaluation",
     "GeodeticOrigin": "frames",
     "LeverArm": "frames",
+    "Estimate": "online.outputs",
+    "Event": "online.outputs",
+    "FixedLagEstimator": "online.estimator",
+    "Outcome": "online.outputs",
     "load_mission": "io.mission_file",
+    "load_setup": "io.mission_file",
     "Attitude": "measurements",
     "Beacon": "beacon",
     "Depth": "measurements",
@@ -68,6 +75,7 @@ _HOME = {
     "Mission": "mission",
     "Reference": "mission",
     "Segment": "mission",
+    "Setup": "mission",
     "Start": "mission",
     "Vehicle": "mission",
     "Options": "options",
@@ -88,15 +96,20 @@ __all__ = [  # noqa: RUF022 - by subject, as in `_HOME`
     "Beacon",
     "Depth",
     "Errors",
+    "Estimate",
+    "Event",
+    "FixedLagEstimator",
     "GeodeticOrigin",
     "LeverArm",
     "Mission",
     "OneWayRange",
     "Options",
+    "Outcome",
     "PositionFix",
     "Reference",
     "Result",
     "Segment",
+    "Setup",
     "SoundSpeedProfile",
     "Start",
     "Trajectory",
@@ -106,6 +119,7 @@ __all__ = [  # noqa: RUF022 - by subject, as in `_HOME`
     "__version__",
     "evaluate",
     "load_mission",
+    "load_setup",
     "smooth",
 ]
 

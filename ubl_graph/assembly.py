@@ -29,6 +29,7 @@ def assemble_segment(
     chain: Chain,
     model: SegmentModel,
     rival: str | None,
+    rival_track: FloatArray | None,
     number: int,
     solver: str,
 ) -> SegmentResult:
@@ -42,6 +43,8 @@ def assemble_segment(
         The segment's nodes and records.
     rival : str or None
         What to say of another track that fits as well.
+    rival_track : array or None
+        Its positions at all nodes, where it is one track.
     number : int
         Of the problem among those of the mission.
     solver : str
@@ -81,6 +84,7 @@ def assemble_segment(
         solution.iterations,
         chi_square,
         dof,
+        None if rival_track is None else rival_track[chain.nodes],
     )
 
 

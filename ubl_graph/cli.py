@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -112,6 +112,50 @@ def demo(
     _print_errors(rows)
 
 
+@app.command()
+def live(
+    config: Annotated[
+        Path,
+        typer.Argument(metavar="CONFIG.toml", help="A mission file without its data table."),
+    ],
+    checkpoint: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Keep the state in this file, and resume from it where it exists.",
+        ),
+    ] = None,
+    udp: Annotated[
+        int | None,
+        typer.Option(
+            metavar="PORT",
+            min=0,
+            max=65535,
+            help="Take the lines from this UDP port on the loopback address instead of standard "
+            "input; 0 takes a free one.",
+        ),
+    ] = None,
+) -> None:
+    """Estimate as the data come: JSON lines in, JSON lines out.
+
+    One record a line, in any order of time inside the lag: two_way_range, one_way_range,
+    velocity, attitude, depth, position; then query, health, reset, set_position. Every ping,
+    position and query is answered by an estimate; what is not used, by a line that says why.
+    A bad line never ends the process. It stops at the end of the input and at SIGTERM or SIGINT,
+    says how it went, and exits 0.
+
+    Example: ubl-graph live vehicle.toml --checkpoint vehicle.state
+
+    {"type": "two_way_range", "beacon": "B1", "t_transmit": 10.0, "t_receive": 10.9,
+    "travel_time": 0.7}
+
+    {"type": "query", "t": 12.0}
+    """
+    from ubl_graph.online.process import serve
+
+    serve(config, checkpoint, udp, _warn)
+
+
 def main() -> None:
     """Entry point: every error made on purpose becomes one line and exit code 2."""
     try:
@@ -124,6 +168,12 @@ def main() -> None:
     except KeyboardInterrupt:
         typer.echo("ubl-graph: interrupted", err=True)
         sys.exit(130)
+
+
+def _warn(text: str) -> None:
+    # Where nobody reads warnings, nobody misses them.
+    with suppress(OSError):
+        typer.echo(f"ubl-graph: {' '.join(text.split())}", err=True)
 
 
 def _solved_by(mission: Mission, solver: str | None) -> Mission:

@@ -44,12 +44,14 @@ class GraphView:
     ----------
     problem : Problem
         What to look at.
+    first : int
+        Number of the first node under GTSAM's keys.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, first: int = 0) -> None:
         self.problem = problem
         layout = problem.layout
-        self.keys: list[int] = keys_of(layout)
+        self.keys: list[int] = keys_of(layout, first)
         # The keys' numbers in `layout.variables`, sorted as gtsam.Values iterates: by key.
         self._zeros = values_of(layout, self.keys, np.zeros(layout.size))
 
@@ -69,7 +71,7 @@ class GraphView:
         graph = gtsam.NonlinearFactorGraph()
         for block, held in zip(self.problem.blocks, frozen, strict=True):
             if block.linear:
-                self._add_linear(graph, block)
+                self.add_linear(graph, block)
             else:
                 self._add_custom(graph, block, held)
         return graph
@@ -81,7 +83,8 @@ class GraphView:
             ordering.push_back(key)
         return ordering
 
-    def _add_linear(self, graph: gtsam.NonlinearFactorGraph, block: Block) -> None:
+    def add_linear(self, graph: gtsam.NonlinearFactorGraph, block: Block) -> None:
+        """Add a linear block's rows to a graph."""
         zero = np.zeros(self.problem.layout.size)
         residual, jacobian = block.evaluate(zero)
         assert jacobian is not None
@@ -165,13 +168,14 @@ class GraphView:
         return evaluate
 
 
-def keys_of(layout: Layout) -> list[int]:
-    """GTSAM keys of all variables, in the layout's order."""
-    beacons = 0
+def keys_of(layout: Layout, first: int = 0) -> list[int]:
+    """GTSAM keys of all variables, in the layout's order; nodes are counted from `first`."""
+    beacons, shared = 0, dict(layout.shared)
     keys: list[int] = []
     for variable in layout.variables:
         if variable.name in LETTERS:
-            keys.append(gtsam.symbol(LETTERS[variable.name], variable.index))
+            node = 0 if variable.name in shared else first
+            keys.append(gtsam.symbol(LETTERS[variable.name], node + variable.index))
         else:
             keys.append(gtsam.symbol("b", beacons))
             beacons += 1

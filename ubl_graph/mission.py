@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import difflib
-from dataclasses import dataclass, field
+import hashlib
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -136,6 +139,124 @@ class Segment:
 
 
 @dataclass(frozen=True, eq=False)
+class Setup:
+    """What is known before any measurement: beacons, water, vehicle, and what was chosen.
+
+    Attributes
+    ----------
+    beacons : tuple of Beacon
+        Names are unique.
+    sound_speed : SoundSpeedProfile
+        Speed over depth, or a constant.
+    vehicle : Vehicle
+        Lever arms.
+    options : Options
+        Everything that can be chosen.
+    start : Start, optional
+        Prior on the position at one time.
+    name : str
+        For titles and file headers.
+    origin : GeodeticOrigin, optional
+        Where the local frame sits on the Earth.
+
+    Raises
+    ------
+    ConfigurationError
+        Where two beacons have the same name.
+    """
+
+    beacons: tuple[Beacon, ...] = ()
+    sound_speed: SoundSpeedProfile = field(default_factory=lambda: SoundSpeedProfile.constant(1500))
+    vehicle: Vehicle = field(default_factory=Vehicle)
+    options: Options = field(default_factory=Options)
+    start: Start | None = None
+    name: str = ""
+    origin: GeodeticOrigin | None = None
+
+    def __post_init__(self) -> None:
+        _check_names(self.beacons)
+
+    @property
+    def beacon_names(self) -> tuple[str, ...]:
+        """Names of the beacons, in order."""
+        return tuple(b.name for b in self.beacons)
+
+    def beacon_numbers(self, names: FloatArray) -> IntArray:
+        """Number in `beacons` of each name, shape (M,); the names are known to be there."""
+        number = {name: i for i, name in enumerate(self.beacon_names)}
+        return np.array([number[str(name)] for name in names], dtype=np.int64)
+
+    @property
+    def uses_eigenrays(self) -> bool:
+        """Whether travel times run along eigenrays (else along straight lines)."""
+        if self.options.rays == "auto":
+            return not self.sound_speed.is_constant
+        return self.options.rays == "eigenray"
+
+    @property
+    def sound_speed_sigma(self) -> float:
+        """Relative standard deviation of the sound speed at a segment's start, in force."""
+        if self.options.sound_speed_sigma is not None:
+            return self.options.sound_speed_sigma
+        return CONSTANT_SIGMA if self.sound_speed.is_constant else PROFILE_SIGMA
+
+    def check_beacons(self, ranges: Any) -> None:
+        """Refuse ranges that name a beacon which is not there.
+
+        Raises
+        ------
+        DataError
+            It names the record, and the beacon that may have been meant.
+        """
+        unknown = ~np.isin(ranges.beacon, np.array(self.beacon_names, dtype=np.str_))
+        if unknown.any():
+            i = int(np.argmax(unknown))
+            name = str(ranges.beacon[i])
+            near = difflib.get_close_matches(name, self.beacon_names, n=1)
+            hint = f"did you mean '{near[0]}'? " if near else ""
+            known = ", ".join(self.beacon_names) or "none"
+            raise ranges.error(i, "beacon", f"unknown beacon '{name}'", f"{hint}known: {known}")
+
+    def check_current(self, velocity: Velocity) -> None:
+        """Refuse velocities relative to the water where the current is no unknown.
+
+        Raises
+        ------
+        DataError
+            It names the record.
+        """
+        water = velocity.reference == "water"
+        if water.any() and not self.options.estimate_current:
+            raise velocity.error(
+                int(np.argmax(water)),
+                "reference",
+                "a velocity relative to the water needs the current as a state",
+                "set estimate_current = true under [options], or drop the water-track rows",
+            )
+
+    def fingerprint(self) -> str:
+        """A hash of all but the name: equal for setups that mean the same."""
+        profile = self.sound_speed
+        parts = (
+            [(b.name, b.position.tolist(), b.sigma.tolist(), b.turnaround) for b in self.beacons],
+            profile.depth.tolist(),
+            profile.speed.tolist(),
+            astuple(self.vehicle),
+            astuple(self.options),
+            None if self.start is None else astuple(self.start),
+            None if self.origin is None else astuple(self.origin),
+        )
+        return hashlib.sha256(repr(parts).encode()).hexdigest()
+
+
+def _check_names(beacons: Sequence[Beacon]) -> None:
+    names = [b.name for b in beacons]
+    for name in names:
+        if names.count(name) > 1:
+            raise ConfigurationError(f"beacon '{name}' is there twice", field="beacon")
+
+
+@dataclass(frozen=True, eq=False)
 class Mission:
     """All that `smooth` needs to know.
 
@@ -174,38 +295,42 @@ class Mission:
     origin: GeodeticOrigin | None = None
 
     def __post_init__(self) -> None:
-        names = [b.name for b in self.beacons]
-        for name in names:
-            if names.count(name) > 1:
-                raise ConfigurationError(f"beacon '{name}' is there twice", field="beacon")
+        _check_names(self.beacons)
         if not self.segments:
             raise DataError("the mission holds no data", "name a data file or a line")
         for segment in self.segments:
             self._check_segment(segment)
 
+    @cached_property
+    def setup(self) -> Setup:
+        """The mission without its records."""
+        return Setup(
+            self.beacons,
+            self.sound_speed,
+            self.vehicle,
+            self.options,
+            name=self.name,
+            origin=self.origin,
+        )
+
     @property
     def beacon_names(self) -> tuple[str, ...]:
         """Names of the beacons, in order."""
-        return tuple(b.name for b in self.beacons)
+        return self.setup.beacon_names
 
     def beacon_numbers(self, names: FloatArray) -> IntArray:
         """Number in `beacons` of each name, shape (M,); the names are known to be there."""
-        number = {name: i for i, name in enumerate(self.beacon_names)}
-        return np.array([number[str(name)] for name in names], dtype=np.int64)
+        return self.setup.beacon_numbers(names)
 
     @property
     def uses_eigenrays(self) -> bool:
         """Whether travel times run along eigenrays (else along straight lines)."""
-        if self.options.rays == "auto":
-            return not self.sound_speed.is_constant
-        return self.options.rays == "eigenray"
+        return self.setup.uses_eigenrays
 
     @property
     def sound_speed_sigma(self) -> float:
         """Relative standard deviation of the sound speed at a segment's start, in force."""
-        if self.options.sound_speed_sigma is not None:
-            return self.options.sound_speed_sigma
-        return CONSTANT_SIGMA if self.sound_speed.is_constant else PROFILE_SIGMA
+        return self.setup.sound_speed_sigma
 
     def _check_segment(self, segment: Segment) -> None:
         records = segment.records()
@@ -224,10 +349,11 @@ class Mission:
                 )
         for kind in ("two_way_range", "one_way_range"):
             if kind in records:
-                self._check_beacons(records[kind])
+                self.setup.check_beacons(records[kind])
         self._check_epochs(segment)
         self._check_attitude(segment, where)
-        self._check_current(segment)
+        if segment.velocity is not None:
+            self.setup.check_current(segment.velocity)
 
     def _check_epochs(self, segment: Segment) -> None:
         """Refuse depth and attitude that do not meet the ranges: they are of another epoch."""
@@ -251,16 +377,6 @@ class Mission:
                     "are all files in the same epoch?",
                 )
 
-    def _check_beacons(self, ranges: Any) -> None:
-        unknown = ~np.isin(ranges.beacon, np.array(self.beacon_names, dtype=np.str_))
-        if unknown.any():
-            i = int(np.argmax(unknown))
-            name = str(ranges.beacon[i])
-            near = difflib.get_close_matches(name, self.beacon_names, n=1)
-            hint = f"did you mean '{near[0]}'? " if near else ""
-            known = ", ".join(self.beacon_names) or "none"
-            raise ranges.error(i, "beacon", f"unknown beacon '{name}'", f"{hint}known: {known}")
-
     def _check_attitude(self, segment: Segment, where: str) -> None:
         if segment.attitude is not None and len(segment.attitude):
             return
@@ -279,15 +395,3 @@ class Mission:
                     "add an attitude file, or leave it out",
                     field=name,
                 )
-
-    def _check_current(self, segment: Segment) -> None:
-        if segment.velocity is None or self.options.estimate_current:
-            return
-        water = segment.velocity.reference == "water"
-        if water.any():
-            raise segment.velocity.error(
-                int(np.argmax(water)),
-                "reference",
-                "a velocity relative to the water needs the current as a state",
-                "set estimate_current = true under [options], or drop the water-track rows",
-            )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from ubl_graph.arrays import BoolArray, FloatArray
@@ -28,6 +30,10 @@ SAME_INSTANT = 1e-6
 LEAST_SHARE: dict[Order, float] = {2: 0.03, 3: 0.1}
 
 
+#: Spacings of regular grids, s: coarser ones would let a vehicle turn between two nodes.
+ROUND_SPACINGS = (0.1, 0.2, 0.25, 0.5, 1.0)
+
+
 def order_of(options: Options) -> Order:
     """Order of the motion prior that the options ask for."""
     return 2 if options.motion == "constant_velocity" else 3
@@ -49,12 +55,7 @@ def node_times(
         Where the span is longer than a year: times of different epochs.
     """
     wanted, kept, sigmas = _candidates(segment, odometry)
-    span = wanted[-1] - wanted[0]
-    if span > 366 * 86400.0:
-        raise DataError(
-            f"the data span {span:g} s, more than a year",
-            "are all times of one segment in the same epoch?",
-        )
+    _check_span(wanted)
     psd = max(options.horizontal_psd, options.vertical_psd)
     order = order_of(options)
     spacing = longest_interval(order, psd, INTERPOLATION_SHARE * min(sigmas))
@@ -65,6 +66,56 @@ def node_times(
         nearer = kept - wanted[before] < wanted[after] - kept
         stay[np.where(nearer, before, after)] = True
     return _filled(_thinned(wanted, stay, spacing, LEAST_SHARE[order] * spacing))
+
+
+def grid_times(
+    segment: Segment, spacing: float, odometry: tuple[Preintegration, ...] = ()
+) -> FloatArray:
+    """Node times at multiples of `spacing` (s) that span a segment's data, strictly increasing.
+
+    The last one lies behind the data, so that every instant with data has a node on either side.
+
+    Raises
+    ------
+    DataError
+        As `node_times` does.
+    """
+    wanted, _, _ = _candidates(segment, odometry)
+    _check_span(wanted)
+    first = slot_of(wanted[0], spacing)
+    return grid(first, slot_of(wanted[-1], spacing) + 2 - first, spacing)
+
+
+def grid(first: int, count: int, spacing: float) -> FloatArray:
+    """Times of `count` nodes of a regular grid from number `first` on, s."""
+    return np.arange(first, first + count, dtype=np.float64) * spacing
+
+
+def slot_of(t: float, spacing: float) -> int:
+    """Number of the grid's interval that holds a time, its beginning included (to a nanosecond)."""
+    return math.floor((t + 1e-9) / spacing)
+
+
+def grid_spacing(options: Options) -> float:
+    """Spacing of a regular grid of nodes, s: as asked for, or what the noise allows, rounded down.
+
+    The interpolation error between nodes stays under `INTERPOLATION_SHARE` of the travel times'
+    noise; a round number puts whole seconds on nodes.
+    """
+    if options.node_spacing is not None:
+        return options.node_spacing
+    sigma = INTERPOLATION_SHARE * options.travel_time_sigma * NOMINAL_SPEED / 2.0
+    longest = longest_interval(order_of(options), options.horizontal_psd, sigma)
+    return max((s for s in ROUND_SPACINGS if s <= longest), default=ROUND_SPACINGS[0])
+
+
+def _check_span(times: FloatArray) -> None:
+    span = times[-1] - times[0]
+    if span > 366 * 86400.0:
+        raise DataError(
+            f"the data span {span:g} s, more than a year",
+            "are all times of one segment in the same epoch?",
+        )
 
 
 def _candidates(

@@ -16,6 +16,7 @@ Motion = Literal["constant_velocity", "constant_acceleration"]
 Loss = Literal["cauchy", "huber", "geman_mcclure", "dcs", "none"]
 Rays = Literal["auto", "straight", "eigenray"]
 Solver = Literal["auto", "gtsam", "banded"]
+OnlineEngine = Literal["lm", "isam2"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,6 +114,16 @@ class Options:
     same answer, the banded solver some 30 times faster. Auto solves on the fast path and has GTSAM
     confirm the answer up to 5 000 nodes; more than 64 shared unknowns GTSAM solves alone."""
 
+    node_spacing: float | None = None
+    """Nodes on a regular grid of this spacing, s. Left out: offline at the measurements' times,
+    online on the grid that the noise asks for (1 s at the defaults)."""
+
+    lag: float = 80.0
+    """Length of the online estimator's window, s; a record that comes later is refused."""
+
+    engine: OnlineEngine = "lm"
+    """Online: the window re-solved by the banded solver, or GTSAM's incremental smoother."""
+
     max_iterations: int = 100
     """Levenberg-Marquardt iterations after which a solve counts as not converged."""
 
@@ -127,6 +138,7 @@ class Options:
             "loss": ("cauchy", "huber", "geman_mcclure", "dcs", "none"),
             "rays": ("auto", "straight", "eigenray"),
             "solver": ("auto", "gtsam", "banded"),
+            "engine": ("lm", "isam2"),
         }
         for name, allowed in choices.items():
             if getattr(self, name) not in allowed:

@@ -68,7 +68,8 @@ class Records:
             )
         size = lengths.pop() if lengths else 1
         for name, array in arrays.items():
-            full = np.broadcast_to(array, (size, *array.shape[1:]))
+            whole = len(array) == size
+            full = array if whole else np.broadcast_to(array, (size, *array.shape[1:]))
             object.__setattr__(self, name, self._column(name, full))
         self._check()
 
@@ -119,6 +120,20 @@ class Records:
 
     def _check(self) -> None:
         """Check across columns; overridden where a kind has such rules."""
+
+    @classmethod
+    def unchecked(cls, **columns: Any) -> Self:
+        """Make records of columns that passed the checks before; nothing is checked or copied.
+
+        Parameters
+        ----------
+        **columns : array
+            Every column without a default; what is left out is None.
+        """
+        made = object.__new__(cls)
+        for f in fields(cls):
+            object.__setattr__(made, f.name, columns.get(f.name))
+        return made
 
     @property
     def _source(self) -> Source | None:

@@ -130,6 +130,8 @@ class SegmentResult:
         Of that problem.
     chi_square, degrees_of_freedom : float, int
         Weighted sum of squared whitened residuals of that problem; rows minus unknowns.
+    rival : array, shape (N, 3), or None
+        Positions at the nodes of another track that fits as well, where one was found.
     """
 
     name: str
@@ -144,6 +146,7 @@ class SegmentResult:
     iterations: int
     chi_square: float
     degrees_of_freedom: int
+    rival: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -147,11 +147,13 @@ def _smooth_group(
         solution, rivals, solver = _solved(work, problem, group, [s for _, s in searched])
     with work.stage("covariance"):
         marginals = Marginals(problem, solution)
-        rival = _rival(problem, solution, marginals, rivals)
+        rival, track = _rival(problem, solution, marginals, rivals)
         if len(group) == 1:
             rival = unanchored(group[0]) or rival
         results = [
-            assemble_segment(problem, solution, marginals, chain, model, rival, number, solver)
+            assemble_segment(
+                problem, solution, marginals, chain, model, rival, track, number, solver
+            )
             for chain, model in zip(problem.layout.chains, group, strict=True)
         ]
         return results, shared_of(problem, solution, marginals)
@@ -239,8 +241,11 @@ def _down_weighted(problem: Problem, solution: Solution) -> float:
 
 def _rival(
     problem: Problem, best: Solution, marginals: Marginals, others: Sequence[Solution]
-) -> str | None:
-    """What to say of another track that fits as well and that the covariance does not cover."""
+) -> tuple[str | None, FloatArray | None]:
+    """Another track that fits as well and that the covariance does not cover.
+
+    Returns what to say of it, and its positions at all nodes.
+    """
     sigma = np.sqrt(np.linalg.eigvalsh(marginals.of("position"))[:, -1])
     covered = max(1.0, COVERED_SIGMAS * float(np.sqrt(np.mean(sigma**2))))
     for other in others:
@@ -253,8 +258,8 @@ def _rival(
                 f"{direction(np.linalg.eigh(gap.T @ gap)[1][:, -1])}), fits as well (its cost is "
                 f"{extra:.2g} higher); a start, a fix, a turn or a second beacon off the line "
                 "would tell"
-            )
-    return None
+            ), problem.layout.get(other.x, "position")
+    return None, None
 
 
 def _vector(mission: Mission, problem: Problem, tracks: Sequence[Track]) -> FloatArray:

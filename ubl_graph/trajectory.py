@@ -138,6 +138,24 @@ def interpolation_variance(
     return dt**3 * (u**3 / 3.0 - 1.25 * u**4) if derivative else (dt * u) ** 5 / 20.0
 
 
+def interpolation_covariance(order: Order, dt: float, s: float) -> FloatArray:
+    """Covariance of the whole state between two known nodes at unit density, (order, order).
+
+    Parameters
+    ----------
+    order : 2 or 3
+        WNOA or WNOJ.
+    dt : float
+        Interval, s.
+    s : float
+        Where in it, 0 to 1.
+    """
+    part = process_noise(order, s * dt)[0]
+    onward = transition(order, (1.0 - s) * dt)[0]
+    w = whitening(order, dt)[0] @ onward @ part
+    return part - w.T @ w
+
+
 def longest_interval(order: Order, psd: float, sd: float) -> float:
     """Longest node interval (s) over which the interpolation's sd in the middle stays under `sd`.
 

@@ -75,6 +75,26 @@ class RobustLoss:
             case "dcs":
                 return np.minimum(1.0, 2.0 * c * c / (q + c * c)) ** 2
 
+    def curvature(self, r: FloatArray) -> FloatArray:
+        """rho''(r) where that is positive, else 0: what Newton's method weighs a row by."""
+        c = WIDTHS[self.name]
+        q = r * r
+        match self.name:
+            case "none":
+                return np.ones_like(r)
+            case "huber":
+                return (q <= c * c).astype(np.float64)
+            case "cauchy":
+                u = q / (c * c)
+                return np.maximum(1.0 - u, 0.0) / (1.0 + u) ** 2
+            case "geman_mcclure":
+                u = q / (c * c)
+                return np.maximum(1.0 - 3.0 * u, 0.0) / (1.0 + u) ** 3
+            case "dcs":
+                phi = c * c
+                outside = 4.0 * phi**2 * (phi - 3.0 * q) / (q + phi) ** 3
+                return np.where(q <= phi, 1.0, np.maximum(outside, 0.0))
+
     def shaped(self, r: FloatArray) -> FloatArray:
         """sign(r) sqrt(2 rho(r)): half its square is the cost."""
         return np.sign(r) * np.sqrt(2.0 * self.cost(r))

@@ -71,9 +71,17 @@ class Preintegration:
         Of the vehicle.
     psd : float
         What the velocity does between two samples: white acceleration noise, m^2/s^3.
+    longest_gap : float, optional
+        Samples farther apart do not join, s; left out, the samples' own rate says it.
     """
 
-    def __init__(self, velocity: Velocity, attitude: AttitudeTrack, psd: float) -> None:
+    def __init__(
+        self,
+        velocity: Velocity,
+        attitude: AttitudeTrack,
+        psd: float,
+        longest_gap: float | None = None,
+    ) -> None:
         rows = velocity[np.argsort(velocity.t)]
         self.t: FloatArray = rows.t
         body = body_vector(rows.forward, rows.right, rows.down)
@@ -89,8 +97,7 @@ class Preintegration:
             axis=1,
         )
         gaps = np.diff(self.t)
-        typical = float(np.median(gaps)) if len(gaps) else 1.0
-        self.longest_gap = max(GAP_FACTOR * typical, MIN_GAP)
+        self.longest_gap = longest_gap_of(gaps) if longest_gap is None else longest_gap
         self._open = gaps <= self.longest_gap
         self._integral = _running(gaps[:, None] * (self._rates[1:] + self._rates[:-1]) / 2.0)
         # White sample noise held over a gap, and what linear interpolation in the gap misses.
@@ -159,6 +166,12 @@ class Preintegration:
         variance = self._variance[k] + s * (self._variance[k1] - self._variance[k])
         missing = self._missing[k] + s * (self._missing[k1] - self._missing[k])
         return self._integral[k] + part, variance, missing
+
+
+def longest_gap_of(gaps: FloatArray) -> float:
+    """Longest gap (s) that samples bridge, by the times between them, shape (M,), s."""
+    typical = float(np.median(gaps)) if len(gaps) else 1.0
+    return max(GAP_FACTOR * typical, MIN_GAP)
 
 
 def odometry(

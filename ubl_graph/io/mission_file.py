@@ -32,7 +32,7 @@ from ubl_graph.io.mission_schema import (
     validated,
 )
 from ubl_graph.io.tables import naming, read_text
-from ubl_graph.mission import RECORD_KINDS, Mission, Segment, Start, Vehicle
+from ubl_graph.mission import RECORD_KINDS, Mission, Segment, Setup, Start, Vehicle
 from ubl_graph.options import Options
 from ubl_graph.records import Records
 
@@ -62,6 +62,44 @@ def load_mission(path: str | Path) -> Mission:
     if isinstance(document, GarposDocument):
         return _garpos_mission(document, path)
     return _csv_mission(document, path)
+
+
+def load_setup(path: str | Path) -> Setup:
+    """Read the configuration of a live process: a mission file without data.
+
+    Parameters
+    ----------
+    path : path
+        TOML file; its tables are those of a mission file, but for [data]. Relative paths in it
+        start at its folder.
+
+    Returns
+    -------
+    Setup
+
+    Raises
+    ------
+    DataError
+        Where a file cannot be read, or a value in it is wrong; it names file and field.
+    ConfigurationError
+        Where the file is no TOML, a key is unknown or missing, a value is of the wrong kind, or
+        data are named; it names the file and the key.
+    """
+    path = Path(path)
+    content = _parsed(path)
+    if "data" in content:
+        raise ConfigurationError(
+            "the configuration of a live process has no data",
+            "leave [data] out; `ubl-graph smooth` takes files with data, and scripts/replay.py "
+            "replays them",
+            file=path,
+            field="data",
+        )
+    document = validated(content, path)
+    assert isinstance(document, CsvDocument)
+    _check_sound_speed(document, path, needed=bool(document.beacon), why="there are beacons")
+    with naming(path):
+        return Setup(**_parts(document, path))
 
 
 def _parsed(path: Path) -> dict[str, Any]:
@@ -108,48 +146,59 @@ def _garpos_mission(document: GarposDocument, path: Path) -> Mission:
 
 
 def _csv_mission(document: CsvDocument, path: Path) -> Mission:
-    _check_parts(document, path)
+    _check_data(document, path)
+    parts = _parts(document, path)
+    rows = _read_records(document.data, path, parts["beacons"], parts["options"], parts["origin"])
+    segment = Segment(start=parts.pop("start"), **rows)
+    with naming(path):
+        return Mission(segments=(segment,), **parts)
+
+
+def _parts(document: CsvDocument, path: Path) -> dict[str, Any]:
+    """All but the data, by the names that `Setup` has for them."""
     origin = _origin(document.mission.origin, path)
     beacons = tuple(_beacon(table, origin, path) for table in document.beacon)
     with naming(path, "options."):
         options = Options(**document.options.given())
     with naming(path, "start."):
         start = Start(**document.start.given()) if document.start else None
-    segment = Segment(start=start, **_read_records(document.data, path, beacons, options, origin))
-    vehicle = _vehicle(document.vehicle, path)
-    sound_speed = _sound_speed(document.sound_speed, path)
-    with naming(path):
-        return Mission(
-            segments=(segment,),
-            beacons=beacons,
-            sound_speed=sound_speed,
-            vehicle=vehicle,
-            options=options,
-            name=_name(document.mission, path),
-            origin=origin,
-        )
+    return {
+        "beacons": beacons,
+        "sound_speed": _sound_speed(document.sound_speed, path),
+        "vehicle": _vehicle(document.vehicle, path),
+        "options": options,
+        "start": start,
+        "name": _name(document.mission, path),
+        "origin": origin,
+    }
 
 
-def _check_parts(document: CsvDocument, path: Path) -> None:
+def _check_data(document: CsvDocument, path: Path) -> None:
     """Refuse a mission that lacks a part, before any file is read."""
     given = document.data.given().keys() & RECORD_KINDS.keys()
-    ranges = given & {"two_way_range", "one_way_range"}
-    needs = {
-        "data": (bool(given), "no data file is named", f"known: {', '.join(RECORD_KINDS)}"),
-        "beacon": (
-            bool(document.beacon) or not ranges,
+    ranges = bool(given & {"two_way_range", "one_way_range"})
+    if not given:
+        raise ConfigurationError(
+            "no data file is named", f"known: {', '.join(RECORD_KINDS)}", file=path, field="data"
+        )
+    if ranges and not document.beacon:
+        raise ConfigurationError(
             "ranges are given, but no beacon",
             "add [[beacon]] with name and position",
-        ),
-        "sound_speed": (
-            document.sound_speed is not None or not ranges,
-            "ranges are given, but no sound speed",
+            file=path,
+            field="beacon",
+        )
+    _check_sound_speed(document, path, needed=ranges, why="ranges are given")
+
+
+def _check_sound_speed(document: CsvDocument, path: Path, *, needed: bool, why: str) -> None:
+    if needed and document.sound_speed is None:
+        raise ConfigurationError(
+            f"{why}, but no sound speed",
             "add [sound_speed] with constant or profile",
-        ),
-    }
-    for field, (there, problem, remedy) in needs.items():
-        if not there:
-            raise ConfigurationError(problem, remedy, file=path, field=field)
+            file=path,
+            field="sound_speed",
+        )
 
 
 def _read_records(

@@ -1,0 +1,128 @@
+"""The finder: a position where there is none, a better one where the pings contradict it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ubl_graph.arrays import FloatArray
+from ubl_graph.mission import Start
+from ubl_graph.online.buffer import ABSOLUTE
+from ubl_graph.online.gate import REOPENS, Gate, distance, limit
+from ubl_graph.online.keeper import Keeper
+from ubl_graph.online.search import Found
+
+#: A track found first is put to the test so long after, s, and when the window is full.
+CONFIRMED_AFTER = (5.0, 10.0, 20.0, 40.0)
+#: Tracks nearer to each other than this are one, m.
+APART = 20.0
+#: Pings that a lost position is looked for with; a fix counts as three.
+ENOUGH = 6
+
+
+class Finder(Keeper):
+    """Looks for the position, and puts it in question."""
+
+    def find(self, now: float) -> None:
+        """Look for the position where there is none, or none to trust."""
+        state, tracker = self.state, self.tracker
+        absolute = sum(len(tracker.buffer.of(kind)) for kind in ABSOLUTE)
+        if absolute > 12 and now - state.searched_at < self.pause and now >= state.searched_at:
+            return
+        if state.located and tracker.absolute_since(state.lost_at) < ENOUGH:
+            # What was known misleads where it no longer holds: a few pings are no match for it.
+            return
+        state.searched_at = now
+        found = tracker.search(self._prior(now))
+        if not found.usable:
+            if not state.located:
+                state.waiting = found.reason
+            return
+        again = state.located
+        adopted = self.guarded(lambda: tracker.adopt(found, anew=True))
+        if not adopted:
+            return
+        state.located, state.waiting = True, ""
+        self._doubt(found)
+        self.regated()
+        if again:
+            self.after_rebuild("the position was found anew")
+        state.located_at = now
+        state.confirm = [now + s for s in CONFIRMED_AFTER if s < self.setup.options.lag]
+        state.confirm.append(now + self.setup.options.lag)
+
+    def _prior(self, now: float) -> Start | None:
+        """What is known of the position where it was lost."""
+        if not self.state.located:
+            return None
+        moment = self.recent()
+        if moment is None:
+            return None
+        dt = now - moment.t
+        sigma = math.sqrt(max(float(np.linalg.eigvalsh(moment.covariance[:2, :2])[-1]), 0.0))
+        drift = math.sqrt(max(float(np.trace(moment.covariance[3:5, 3:5])), 0.0)) * abs(dt)
+        sigma = math.hypot(sigma, drift)
+        if not 0.0 < sigma < 1e4:
+            return None
+        east, north, up = moment.mean[:3] + dt * moment.mean[3:]
+        return Start(now, float(east), float(north), float(up), sigma)
+
+    def confirm(self, now: float) -> None:
+        """Put a young or ambiguous track to the test: a search may find a better one."""
+        state, tracker = self.state, self.tracker
+        due = bool(state.confirm) and now >= state.confirm[0]
+        if state.ambiguous and now - state.searched_at >= self.setup.options.lag / 8.0:
+            due = True
+        if not due or not state.located:
+            return
+        state.confirm = [t for t in state.confirm if t > now]
+        state.searched_at = now
+        found = tracker.search()
+        if not found.usable:
+            return
+        if self.guarded(lambda: tracker.adopt(found)):
+            self.after_rebuild("a better track was found")
+            self.regated()
+        elif not found.ambiguous and (gap := self._apart(found)) is not None:
+            away = float(np.hypot(*gap[:2]))
+            state.ambiguous = f"ambiguous: the last pings alone ask for a place {away:.0f} m away"
+            state.rival = gap
+            return
+        self._doubt(found)
+
+    def _doubt(self, found: Found) -> None:
+        """Take note of whether a found track is the only one."""
+        self.state.ambiguous = found.reason if found.ambiguous else ""
+        self.state.rival = found.rival if found.ambiguous else None
+
+    def _apart(self, found: Found) -> FloatArray | None:
+        """How far a found track ends from the present one, m; None where its sigmas cover that."""
+        assert found.result is not None
+        track = found.result.segments[0].trajectory
+        moment = self.guarded(lambda: self.tracker.moment(float(track.t[-1])))
+        if moment is None:
+            return None
+        gap = track.position[-1] - moment.mean[:3]
+        spread = track.covariance[-1][:2, :2] + moment.covariance[:2, :2]
+        near = distance(gap[:2], spread) < 2.0 * limit(2) or float(np.hypot(*gap[:2])) < APART
+        return None if near else gap
+
+    def reopen(self, gate: Gate, now: float) -> None:
+        """See, after many refusals, whether the vehicle stands elsewhere, as they say."""
+        state = self.state
+        if not gate.is_doubtful or 0.0 <= now - state.doubted_at < self.pause:
+            return
+        state.doubted_at = now
+        here = [e for e in list(gate.refused)[-2 * REOPENS :] if self.tracker.holds(e)]
+        here = [e for e in here if e.gated]
+        if len(here) < REOPENS - 1 or not self.guarded(lambda: self.tracker.break_at(here)):
+            return
+        self.after_rebuild("the pings contradicted the track")
+        self.regated()
+        gate.recent.clear()
+
+    @property
+    def pause(self) -> float:
+        """Time between searches, s: they take as long as a hundred solves."""
+        return max(1.0, self.setup.options.lag / 16.0)

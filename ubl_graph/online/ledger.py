@@ -1,0 +1,307 @@
+"""The ledger: buffer and window kept in step as records come and time goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ubl_graph.arrays import FloatArray, IntArray
+from ubl_graph.factors.odometry import longest_gap_of
+from ubl_graph.factors.ranges import RangeBlock
+from ubl_graph.mission import Setup
+from ubl_graph.nodes import grid, grid_spacing, slot_of
+from ubl_graph.online.buffer import PINGS, Buffer, Entry
+from ubl_graph.online.engines import Context, engine_of
+from ubl_graph.online.equations import Point, WindowEquations
+from ubl_graph.online.rows import Break, Frame
+from ubl_graph.online.window import RowsOf, Window, frame_of
+from ubl_graph.solve.banded import BandedFactor
+
+#: The window keeps so many seconds more than the lag: neighbours of the oldest records.
+MARGIN = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """Where the window was solved last: its first node then, pings, rows, equations, and point."""
+
+    first: int
+    pings: Sequence[Entry]
+    ranges: Sequence[RangeBlock]
+    equations: WindowEquations
+    point: Point
+
+
+class Ledger:
+    """Buffer, window and engine.
+
+    Parameters
+    ----------
+    setup : Setup
+        Beacons, sound speed, vehicle and options.
+
+    Attributes
+    ----------
+    located : bool
+        Whether there is a position.
+    rebuilds : int
+        Solves that failed, or contradicted what came after, and were begun anew.
+    horizontal_sigma : float
+        Of the newest node, when a ping was judged last, m.
+    turned : list of Entry
+        Records whose fate the last solves turned; who tells of them empties it.
+    """
+
+    def __init__(self, setup: Setup) -> None:
+        self.setup = setup
+        self.spacing = grid_spacing(setup.options)
+        self.lag = setup.options.lag
+        self.buffer = Buffer()
+        self.window: Window | None = None
+        self.located = False
+        self.rebuilds = 0
+        self.kinds: set[str] = set()
+        self._engine = engine_of(setup.options.engine)
+        self._solved: Solved | None = None
+        self._factor: BandedFactor | None = None
+        # Velocities that have come, and how many had when their pace was looked at last.
+        self._velocities = self._paced = 0
+        self._spread = 1.0
+        self._judging: Context | None = None
+        self.horizontal_sigma = 0.0
+        self.turned: list[Entry] = []
+
+    def restore_window(
+        self,
+        first: int,
+        scales: tuple[float, float],
+        x: FloatArray,
+        common: FloatArray,
+        prior: tuple[FloatArray, FloatArray],
+        breaks: dict[int, Break],
+        pristine: bool,
+    ) -> None:
+        """Put a window together again; its rows come from the buffer.
+
+        Parameters
+        ----------
+        first : int
+            Number of its first node.
+        scales : (float, float)
+            The heading's lasting error, rad, and the longest gap that velocities bridge, s.
+        x, common : array
+            Unknowns of the nodes (N, W), and of what they share.
+        prior : (array, array)
+            Rows and right-hand sides.
+        breaks : dict of int to Break
+            Where the vehicle may have jumped.
+        pristine : bool
+            Whether its first node is the very first one.
+        """
+        lasting, gap = scales
+        frame = frame_of(self.setup, self.kinds, lasting, gap, self.spacing)
+        self.window = Window.of(frame, self.buffer, first, x, common, prior)
+        self.window.breaks, self.window.is_pristine = breaks, pristine
+        self._velocities = len(self.buffer.of("velocity"))
+        self._paced = self._velocities
+
+    def insert(self, entry: Entry) -> None:
+        """Take a record into the buffer and mark what it changes."""
+        self.buffer.add(entry)
+        self._velocities += entry.kind == "velocity"
+        self._learn(entry)
+        if self.window is None:
+            if entry.kind in ("attitude", "depth"):
+                return
+            first = slot_of(entry.begin, self.spacing)
+            self.window = Window(self._frame(), self.buffer, first)
+        self._touch(entry)
+
+    def regate(self, entry: Entry, gated: bool, reason: str = "") -> None:
+        """Turn an entry's fate."""
+        entry.gated, entry.reason = gated, reason
+        self._touch(entry)
+
+    def _touch(self, entry: Entry) -> None:
+        window = self.window
+        if window is None or entry.kind in PINGS:
+            return
+        begin = end = entry.t
+        if entry.kind in ("velocity", "attitude"):
+            before, after = self.buffer.neighbours(entry)
+            begin = entry.t if before is None else before.t
+            end = entry.t if after is None else after.t
+            if entry.kind == "attitude":
+                # It is held where there is none before or after it.
+                begin = window.begin if before is None else begin
+                end = window.end if after is None else end
+                around = self.buffer.around("velocity", begin, end)
+                begin = min([begin, *(e.t for e in around[:1])])
+                end = max([end, *(e.t for e in around[-1:])])
+        window.touch(begin, end)
+
+    def _learn(self, entry: Entry) -> None:
+        """Take in the unknowns that a new kind of record asks for."""
+        before = len(self.kinds)
+        if entry.kind == "one_way_range":
+            self.kinds.add(entry.kind)
+        if entry.kind in ("velocity", "attitude") and self.buffer.of("attitude"):
+            if entry.kind == "velocity":
+                self.kinds.add(entry.values[-1])
+            elif not {"bottom", "water"} & self.kinds:
+                self.kinds.update(e.values[-1] for e in self.buffer.of("velocity"))
+        if len(self.kinds) > before and self.window is not None:
+            self.window.reframe(self._frame())
+            self._forget()
+
+    def _frame(self) -> Frame:
+        entries = self.buffer.of("attitude")
+        lasting = float(np.median([e.values[4] for e in entries])) if entries else 0.0
+        if self.window is not None and self.window.frame.lasting > 0.0:
+            lasting = self.window.frame.lasting
+        return frame_of(self.setup, self.kinds, lasting, self._gap(), self.spacing)
+
+    def _gap(self) -> float:
+        times = np.array([e.t for e in self.buffer.of("velocity")])
+        return longest_gap_of(np.diff(times))
+
+    def _forget(self) -> None:
+        """What was solved holds no longer."""
+        self._solved = self._factor = self._judging = None
+        self._engine.forget()
+
+    def begin_at(self, t: float) -> None:
+        """Let the window begin earlier, at `t` (s), if its first node is the very first one."""
+        window = self.window
+        if window is None or not window.is_pristine:
+            return
+        slot = slot_of(t, self.spacing)
+        earlier = Window(window.frame, self.buffer, slot)
+        earlier.extend(window.end - self.spacing)
+        back = grid(slot - window.first, window.first - slot, self.spacing)
+        earlier.x[: len(back)] = window.predicted(window.x[0], back)
+        earlier.x[len(back) :] = window.x
+        earlier.common = window.common
+        self.window = earlier
+        self._forget()
+
+    def leap(self, t: float) -> None:
+        """Carry what is known over a silence to `t`, s."""
+        window = self.window
+        assert window is not None
+        while window.count > 1:
+            self._drop_first()
+        window.leap(slot_of(t, self.spacing))
+        self._forget()
+
+    def extend(self, t: float) -> None:
+        """Make nodes up to `t`, s."""
+        if self.window is not None:
+            self.window.extend(t)
+
+    def holds(self, entry: Entry) -> bool:
+        """Whether a ping lies within the window."""
+        window = self.window
+        return (
+            window is not None
+            and self.buffer.twin(entry) is entry
+            and entry.kind in PINGS
+            and entry.begin >= window.begin - 1e-9
+        )
+
+    def absolute_since(self, t: float) -> int:
+        """Pings since `t` (s), a fix counted as three."""
+        pings = sum(e.begin >= t for kind in PINGS for e in self.buffer.of(kind))
+        marks = ("position", "set_position")
+        return pings + 3 * sum(e.t >= t for kind in marks for e in self.buffer.of(kind))
+
+    def leaving(self, t: float) -> list[Entry]:
+        """Pings, depths and fixes that `trim` would part with when the newest record is at `t`."""
+        if self.window is None:
+            return []
+        begin, end = self.window.begin - 1e-9, self._first_kept(t) * self.spacing - 1e-9
+        leaving = [e for kind in PINGS for e in self.buffer.of(kind) if begin <= e.begin < end]
+        for kind in ("depth", "position", "set_position"):
+            leaving += self.buffer.between(kind, begin, end)
+        return leaving
+
+    def is_due(self, t: float) -> bool:
+        """Whether nodes are older than the lag when the newest record is at `t`, s."""
+        return self.window is not None and self._first_kept(t) > self.window.first
+
+    def trim(self, t: float) -> None:
+        """Let go what is older than the lag when the newest record is at `t`, s."""
+        window = self.window
+        if window is None:
+            self.buffer.trim(t - self.lag - MARGIN)
+            return
+        if not self.is_due(t):
+            return
+        while self._first_kept(t) > window.first and window.count > 2:
+            self._drop_first()
+        self.buffer.trim(window.begin - MARGIN)
+
+    def _first_kept(self, t: float) -> int:
+        return slot_of(t - self.lag - MARGIN, self.spacing)
+
+    def _drop_first(self) -> None:
+        window = self.window
+        assert window is not None
+        if window.is_first_dirty:
+            self._engine.note(window.refresh())
+        window.drop(self._rows_leaving(window.begin + self.spacing - 1e-9))
+
+    def _rows_leaving(self, before: float) -> list[RowsOf]:
+        """Linearised rows of the window's pings that begin before a time, s."""
+        window = self.window
+        assert window is not None
+        if not self.located:
+            return []
+        leaving = [e for e in window.usable() if e.begin < before]
+        solved = self._solved
+        if solved is None or any(e not in solved.pings for e in leaving):
+            ranges = window.ranges(leaving)
+            x = window.vector
+            kinds = [[e for e in leaving if e.kind == b.name] for b in ranges]
+            parts = [(b.columns, *_raw(b, x, b.frozen(x))) for b in ranges]
+        else:
+            kinds = [[e for e in solved.pings if e.kind == b.name] for b in solved.ranges]
+            parts = [
+                (self._moved(b.columns, solved), *point)
+                for b, point in zip(solved.ranges, solved.point.curved, strict=True)
+            ]
+        rows: list[RowsOf] = []
+        for some, (columns, r, slope) in zip(kinds, parts, strict=True):
+            at = [i for i, e in enumerate(some) if e in leaving]
+            if at:
+                root = np.sqrt(window.loss.weights(r[at]))
+                rows.append(RowsOf(columns[at], root * r[at], root[:, None] * slope[at]))
+        return rows
+
+    def _moved(self, columns: IntArray, solved: Solved) -> IntArray:
+        """Columns of a solved window where the nodes stand now."""
+        window = self.window
+        assert window is not None
+        w = window.frame.width
+        before, after = solved.equations.nodes * w, window.count * w
+        inner = columns - (window.first - solved.first) * w
+        return np.where(
+            columns < 0, -1, np.where(columns < before, inner, columns - before + after)
+        )
+
+    def shift(self, slots: int) -> None:
+        """Move all that is known by so many nodes: the clock was set."""
+        by = slots * self.spacing
+        self.buffer.shift(by)
+        if self.window is not None:
+            self.window.shift(slots)
+        self._forget()
+
+
+def _raw(block: RangeBlock, x: FloatArray, held: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Whitened residuals (M,) and Jacobians (M, C) of a block."""
+    r, slope = block.evaluate(x, held)
+    assert slope is not None
+    return r[:, 0], slope[:, 0]

@@ -1,0 +1,443 @@
+"""The tracker: the window solved, read, and put in question.
+
+It knows nothing of clocks, time-outs and outputs; that is the estimator's business.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+
+from ubl_graph.arrays import FloatArray
+from ubl_graph.factors.ranges import RangeBlock
+from ubl_graph.mission import Start
+from ubl_graph.nodes import slot_of
+from ubl_graph.online.buffer import PINGS, Entry
+from ubl_graph.online.engines import Context
+from ubl_graph.online.equations import Point
+from ubl_graph.online.gate import distance, limit
+from ubl_graph.online.ledger import Ledger, Solved
+from ubl_graph.online.lm import minimise
+from ubl_graph.online.rows import Break, attitude_over
+from ubl_graph.online.search import Found, placed, search
+from ubl_graph.online.state import Moment, moment_at, tail_covariance, trajectory_of
+from ubl_graph.online.window import Window
+from ubl_graph.solve.banded import BandedFactor
+from ubl_graph.solve.rounds import GRADUATION
+from ubl_graph.trajectory import Trajectory
+
+#: Steps of a solve at a ping; the next one goes on where it ends.
+STEPS = 8
+#: Steps of a solve from afar.
+STEPS_AFAR = 60
+#: Where a ping is expected this much less sharply than it measures, it pulls from its convex side.
+WIDE = 20.0
+#: A standard deviation that takes a row out of the equations, as a multiple of its own.
+MUTED = 1e9
+#: After so many velocities their pace is looked at again.
+LOOK_AT_PACE = 20
+#: A track found anew replaces the present one where its cost is lower by more than this.
+BETTER_COST = 3.0
+#: So many of the pings since a jump must agree with the track behind it, as a share.
+AGREEING = 0.6
+#: What a jump must save, in cost: its own price, and odds of thousands to one.
+BREAK_COST = 12.0
+#: Nearest to which the vehicle may have stepped at a break, m, in multiples of what was refused.
+LEAST_STEP, STEP_FACTOR = 10.0, 3.0
+#: Acoustic metres per second, for words and widths.
+METRES = 1500.0
+
+
+class Tracker(Ledger):
+    """Buffer, window and engine; solves what the ledger holds."""
+
+    def judge(self, entry: Entry) -> tuple[float, int]:
+        """Solve without a ping or fix that is in the buffer, and compare it with what is expected.
+
+        The window stands solved without it afterwards.
+
+        Returns
+        -------
+        float, int
+            Mahalanobis distance and number of components.
+        """
+        if entry.kind not in PINGS:
+            return self._judge_fix(entry)
+        window = self._refreshed()
+        self._spread = 1.0
+        if not self._answers(window, entry):
+            return 0.0, 1
+        context = self._context(window)
+        block, row = _place_of(entry, context.pings, context.ranges)
+        frozen = context.equations.frozen
+        muted = [held.copy() for held in frozen]
+        muted[block][row] *= MUTED
+        context.equations.frozen = muted
+        x = window.vector
+        point = context.equations.evaluate(x)
+        factor = context.equations.factor(point)
+        if window.is_touched:
+            # Only linear rows have changed: one step is all but exact, and the solve goes on.
+            x = x + factor.solve(-context.equations.gradient(point))
+            window.put(x)
+        context.equations.frozen = frozen
+        self._judging = context
+        r, slope = context.ranges[block].evaluate(x, frozen[block], slice(row, row + 1))
+        assert slope is not None
+        line = np.zeros(len(x) + 1)
+        columns = context.ranges[block].columns[row]
+        np.add.at(line, np.where(columns < 0, len(x), columns), slope[0, 0])
+        line = line[:-1]
+        self._spread = 1.0 + float(np.einsum("i,i->", line, factor.solve(line)))
+        last = tail_covariance(factor, window.frame.width, window.count * window.frame.width)
+        self.horizontal_sigma = float(np.sqrt(np.linalg.eigvalsh(last[:2, :2])[-1]))
+        return abs(float(r[0, 0])) / np.sqrt(self._spread), 1
+
+    def _context(self, window: Window) -> Context:
+        """Rows and equations of all pings that count."""
+        pings = window.usable()
+        ranges = window.ranges(pings)
+        equations = window.equations(ranges)
+        x = window.vector
+        equations.frozen = [b.frozen(x) for b in ranges]
+        return Context(window.first, pings, ranges, equations)
+
+    @staticmethod
+    def _answers(window: Window, entry: Entry) -> bool:
+        """Whether a ping can be used as things stand."""
+        return any(e is entry for e in window.usable())
+
+    def _judge_fix(self, entry: Entry) -> tuple[float, int]:
+        self._spread = 1.0
+        self.regate(entry, True)
+        self.solve()
+        moment = self.moment(entry.t)
+        self.regate(entry, False)
+        lever = np.zeros(3)
+        if isinstance(entry.record, Start):
+            start = entry.record
+            known = [start.east, start.north] + ([] if start.up is None else [start.up])
+            place, covariance = np.array(known), start.sigma**2 * np.eye(len(known))
+        else:
+            place, covariance = entry.values[1][0], entry.values[2][0]
+            track = attitude_over(self.buffer, entry.t, entry.t)
+            arm = self.setup.vehicle.antenna
+            if track is None and not arm.is_zero:
+                return 0.0, len(place)
+            if track is not None:
+                lever = track.lever(arm, np.array([entry.t]))[0]
+        d = len(place)
+        gap = place - (moment.mean[:3] + lever)[:d]
+        return distance(gap, covariance + moment.covariance[:d, :d]), d
+
+    @property
+    def is_wide(self) -> bool:
+        """Whether the ping judged last measures far more sharply than it was expected."""
+        return self._spread > WIDE**2
+
+    def solve(self, afar: bool = False) -> None:
+        """Solve the window from where it is; `afar`: from the convex side of the loss."""
+        window = self._refreshed()
+        judged, self._judging = self._judging, None
+        fits = (
+            judged is not None
+            and (judged.first, judged.equations.nodes) == (window.first, window.count)
+            and judged.pings == window.usable()
+        )
+        context = judged if judged is not None and fits else self._context(window)
+        equations, x = context.equations, window.vector
+        if afar and context.ranges:
+            frozen = equations.frozen
+            for width in GRADUATION:
+                equations.frozen = [width * held for held in frozen]
+                x = minimise(equations, x, STEPS_AFAR).x
+            equations.frozen = [b.frozen(x) for b in context.ranges]
+        point = self._engine.solve(window, context, x, STEPS_AFAR if afar else STEPS)
+        window.put(point.x)
+        self._keep(context, point)
+
+    def _keep(self, context: Context, point: Point) -> None:
+        window = self.window
+        assert window is not None
+        self._solved = Solved(window.first, context.pings, context.ranges, context.equations, point)
+        self._factor = None
+
+    def cost_from(self, x: FloatArray) -> tuple[float, FloatArray]:
+        """What the window would cost, all pings counted, solved from `x`; and where that ends."""
+        window = self._refreshed()
+        with self._opened():
+            ranges = window.ranges(window.usable())
+            equations = window.equations(ranges)
+            equations.frozen = [b.frozen(x) for b in ranges]
+            point = minimise(equations, x, STEPS_AFAR)
+        return point.cost, point.x
+
+    def _refreshed(self) -> Window:
+        window = self.window
+        assert window is not None
+        news = self._velocities - self._paced
+        if news >= LOOK_AT_PACE or (news and self._velocities < 2 * LOOK_AT_PACE):
+            self._paced = self._velocities
+            gap = self._gap()
+            if abs(gap - window.frame.gap) > 1e-3 * gap:
+                window.regap(gap)
+        if window.is_dirty:
+            self._engine.note(window.refresh())
+        return window
+
+    @property
+    def is_stale(self) -> bool:
+        """Whether records have come since the last solve."""
+        return self.window is not None and (self.window.is_touched or self._solved is None)
+
+    def factor(self) -> BandedFactor:
+        """Factor of the normal matrix where the window was solved last."""
+        assert self.window is not None
+        solved, window = self._solved, self.window
+        fits = (
+            solved is not None
+            and solved.first == window.first
+            and solved.equations.nodes == window.count
+        )
+        if not fits:
+            self._evaluate()
+        if self._factor is None:
+            assert self._solved is not None
+            self._factor = self._solved.equations.factor(self._solved.point)
+        return self._factor
+
+    def _evaluate(self) -> None:
+        """The equations where the window stands, for covariances."""
+        window = self._refreshed()
+        context = self._context(window)
+        self._keep(context, context.equations.evaluate(window.vector))
+
+    # -- what it says --
+
+    def recent(self, t: float) -> Moment | None:
+        """Position and velocity at `t` (s), not before the last node of the last solve but one.
+
+        What has come since is not in it: it takes no solve. None where there was none.
+        """
+        window, solved = self.window, self._solved
+        if window is None or solved is None:
+            return None
+        if self._factor is None:
+            self._factor = solved.equations.factor(solved.point)
+        last = solved.first + solved.equations.nodes - 1
+        ends = window.x[last - 1 - window.first : last + 1 - window.first]
+        return moment_at(window.frame, self._factor, ends, last * self.spacing, t)
+
+    def moment(self, t: float) -> Moment:
+        """Position and velocity at `t` (s), in the window or ahead of it."""
+        window = self.window
+        assert window is not None
+        factor = self.factor()
+        if t >= window.end - self.spacing:
+            return moment_at(window.frame, factor, window.x[-2:], window.end, t)
+        states = trajectory_of(window, factor).at(max(t, window.begin))
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3], covariance[3:, 3:] = states.covariance[0], states.velocity_covariance[0]
+        return Moment(t, np.concatenate([states.position[0], states.velocity[0]]), covariance)
+
+    def trajectory(self) -> Trajectory:
+        """The whole window with covariances."""
+        assert self.window is not None
+        return trajectory_of(self.window, self.factor())
+
+    def residuals(self, pings: Sequence[Entry] | None = None) -> list[tuple[Entry, float]]:
+        """Whitened residuals of some pings, or of all in the window, gated ones too."""
+        window = self._refreshed()
+        with self._opened():
+            usable = window.usable()
+            if pings is not None:
+                usable = [e for e in usable if e in pings]
+            x = window.vector
+            out: list[tuple[Entry, float]] = []
+            for block in window.ranges(usable):
+                kind = [e for e in usable if e.kind == block.name]
+                r, _ = block.evaluate(x, block.frozen(x), jacobian=False)
+                out += list(zip(kind, (float(v) for v in r[:, 0]), strict=True))
+        return out
+
+    @contextmanager
+    def _opened(self) -> Generator[None]:
+        """Count gated pings in for a while."""
+        gated = [e for kind in PINGS for e in self.buffer.of(kind) if e.gated]
+        for entry in gated:
+            entry.gated = False
+        try:
+            yield
+        finally:
+            for entry in gated:
+                entry.gated = True
+
+    def _residuals_kept(self, pings: Sequence[Entry]) -> list[tuple[Entry, float]]:
+        """Whitened residuals of some pings, from the last solve where it holds them all."""
+        solved = self._solved
+        if solved is None or any(e not in solved.pings for e in pings):
+            return self.residuals(pings)
+        out: list[tuple[Entry, float]] = []
+        for block, (r, _) in zip(solved.ranges, solved.point.curved, strict=True):
+            kind = [e for e in solved.pings if e.kind == block.name]
+            out += [(e, float(v)) for e, v in zip(kind, r, strict=True) if e in pings]
+        return out
+
+    def _depth_residuals(self, entries: Sequence[Entry]) -> list[tuple[Entry, float]]:
+        """Whitened residuals of depths."""
+        window = self.window
+        assert window is not None
+        some = [e for e in entries if e.kind == "depth" and window.begin <= e.t <= window.end]
+        arm = self.setup.vehicle.depth_sensor
+        if not some:
+            return []
+        times = np.array([e.t for e in some])
+        track = None
+        if not arm.is_zero:
+            track = attitude_over(self.buffer, float(times.min()), float(times.max()))
+            if track is None:
+                return []
+        layout = window.layout
+        at = layout.positions_at(layout.chains[0], times)
+        up = (window.vector[at.columns[:, :, 2]] * at.weights).sum(axis=1)
+        lever = np.zeros(len(times)) if track is None else track.lever(arm, times)[:, 2]
+        return [
+            (e, (u + a + e.values[1]) / e.values[2])
+            for e, u, a in zip(some, up, lever, strict=True)
+        ]
+
+    def chi_square(self) -> tuple[float, int]:
+        """Sum of the weighted squared residuals of the window's pings, and how many there are."""
+        if self._solved is None or self.window is None:
+            return 0.0, 0
+        total, count = 0.0, 0
+        for r, _ in self._solved.point.curved:
+            total += float(np.sum(self.window.loss.weights(r) * r * r))
+            count += len(r)
+        return total, count
+
+    # -- beginning anew --
+
+    def search(self, start: Start | None = None) -> Found:
+        """Look for the position in all that the buffer holds."""
+        assert self.window is not None
+        return search(self.setup, self.buffer, self.spacing, self.window.begin, start)
+
+    def adopt(self, found: Found, anew: bool = False) -> bool:
+        """Go on from a found track where that fits better than the present one; whether it did.
+
+        `anew`: there is no present one to trust.
+        """
+        window = self._refreshed()
+        cost, x = self.cost_from(placed(window, found))
+        if not anew and cost > self.cost_from(window.vector)[0] - BETTER_COST:
+            return False
+        window.put(x)
+        self._engine.forget()
+        self.located = True
+        self._judged(self.residuals())
+        self.solve()
+        return True
+
+    def _judged(self, residuals: Sequence[tuple[Entry, float]]) -> bool:
+        """Gate records by their residuals where the window stands; whether a fate turned."""
+        turned = False
+        for entry, r in residuals:
+            bad = abs(r) > limit(1)
+            if bad != entry.gated:
+                self.regate(entry, bad, f"{abs(r):.1f} sigma from the track" if bad else "")
+                self.turned.append(entry)
+                turned = True
+        return turned
+
+    def break_at(self, refused: Sequence[Entry]) -> bool:
+        """Let the vehicle have jumped before some refused pings; whether that explains them.
+
+        The track behind the jump is looked for from where it is and from nothing; it is taken
+        where it lowers the cost of all pings by more than a jump is worth, and most pings since
+        then agree with it.
+        """
+        window = self._refreshed()
+        saved, breaks = window.vector, dict(window.breaks)
+        begin = max(min(e.begin for e in refused), window.begin)
+        present, _ = self.cost_from(saved)
+        sizes = [abs(r) * self._metres(e) for e, r in self.residuals(refused)]
+        slot = max(slot_of(begin, self.spacing) - 1, window.first)
+        window.breaks[slot] = Break(max(LEAST_STEP, STEP_FACTOR * max(sizes, default=0.0)))
+        window.touch(slot * self.spacing, slot * self.spacing)
+        guesses = [saved]
+        found = search(self.setup, self.buffer, self.spacing, begin)
+        if found.usable:
+            guesses.append(placed(window, found, slot + 1))
+        cost, x = min((self.cost_from(self._from_afar(g)) for g in guesses), key=lambda c: c[0])
+        window.put(x)
+        since = [abs(r) < limit(1) for e, r in self.residuals() if e.begin >= begin]
+        if cost < present - BREAK_COST and np.mean(since) >= AGREEING:
+            self.rebuilds += 1
+            self._forget()
+            self._judged(self.residuals())
+            self.solve()
+            return True
+        window.put(saved)
+        window.breaks = breaks
+        window.touch(slot * self.spacing, slot * self.spacing)
+        self._forget()
+        return False
+
+    def _from_afar(self, x: FloatArray) -> FloatArray:
+        """Approach the window's least cost from the loss' convex side, all pings counted."""
+        window = self._refreshed()
+        with self._opened():
+            context = self._context(window)
+        for width in GRADUATION:
+            context.equations.frozen = [width * b.frozen(x) for b in context.ranges]
+            x = minimise(context.equations, x, STEPS_AFAR).x
+        return x
+
+    @staticmethod
+    def _metres(entry: Entry) -> float:
+        """Metres of a sigma of a ping."""
+        legs = 2.0 if entry.kind == "two_way_range" else 1.0
+        return entry.values[-1] * METRES / legs
+
+    def rebuild(self) -> None:
+        """Begin anew from the buffer and the prior of what is older: rows, engine, solution.
+
+        Raises
+        ------
+        SolverError
+            Where that fails, too.
+        """
+        window = self.window
+        assert window is not None
+        self.rebuilds += 1
+        self._forget()
+        window.touch_all()
+        if not np.isfinite(window.vector).all():
+            window.put(np.zeros_like(window.vector))
+            self.located = False
+            return
+        self.solve(afar=True)
+
+    def decide(self, t: float) -> None:
+        """Judge the records that will leave by the track as it is now; solve again if that matters.
+
+        `turned` tells whose fate turned.
+        """
+        leaving = [e for e in self.leaving(t) if e.kind in PINGS or e.kind == "depth"]
+        if not leaving:
+            return
+        pings = [e for e in leaving if e.kind in PINGS]
+        turned = self._judged([*self._residuals_kept(pings), *self._depth_residuals(leaving)])
+        if turned:
+            self.solve()
+
+
+def _place_of(
+    entry: Entry, pings: Sequence[Entry], ranges: Sequence[RangeBlock]
+) -> tuple[int, int]:
+    """Block and row of a ping."""
+    block = next(i for i, b in enumerate(ranges) if b.name == entry.kind)
+    return block, [e for e in pings if e.kind == entry.kind].index(entry)

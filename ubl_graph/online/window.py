@@ -1,0 +1,490 @@
+"""A window of nodes on a regular grid: unknowns, rows, pings, and the prior that the past left.
+
+Node k stands at k times the grid's spacing. What the records between two nodes say is held as
+rows of that interval and made anew where a late record falls into it. A node that leaves the window
+is eliminated by QR from all rows that touch it (a square root keeps what is weakly known, a
+difference of normal equations does not); what remains is the prior of the nodes behind it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ubl_graph.arrays import FloatArray, IntArray
+from ubl_graph.factors.block import Block, LinearBlock
+from ubl_graph.factors.loss import RobustLoss
+from ubl_graph.factors.ranges import RangeBlock
+from ubl_graph.graph import Builder, shared_states
+from ubl_graph.layout import KINEMATIC, Layout
+from ubl_graph.mission import Setup
+from ubl_graph.nodes import grid, order_of, slot_of
+from ubl_graph.online.buffer import PINGS, Buffer, Entry, columns_of
+from ubl_graph.online.equations import LinearRows, WindowEquations
+from ubl_graph.online.rows import Break, Frame, attitude_over, interval_rows, triangle
+from ubl_graph.trajectory import transition
+
+
+@dataclass(frozen=True, eq=False)
+class RowsOf:
+    """Linearised rows of pings, weighted by the loss.
+
+    Attributes
+    ----------
+    columns : array of int, shape (M, C)
+        Of the window; -1 pads.
+    residual : array, shape (M,)
+        Where the window stands.
+    slope : array, shape (M, C)
+        Its derivatives.
+    """
+
+    columns: IntArray
+    residual: FloatArray
+    slope: FloatArray
+
+
+class Window:
+    """The nodes of the last lag.
+
+    Parameters
+    ----------
+    frame : Frame
+        What the unknowns are.
+    buffer : Buffer
+        The records.
+    first : int
+        Number of the first node.
+
+    Attributes
+    ----------
+    first, count : int
+        Number of the first node, and how many nodes there are (two at the least).
+    x : array, shape (N, W)
+        Nodes' unknowns in the layout's units.
+    common : array, shape (B,)
+        What all nodes share.
+    breaks : dict of int to Break
+        Intervals in which the vehicle may have jumped.
+    is_pristine : bool
+        Whether the first node is the very first one.
+    """
+
+    def __init__(self, frame: Frame, buffer: Buffer, first: int) -> None:
+        self.frame, self._buffer = frame, buffer
+        self.first, self.count = first, 2
+        self.breaks: dict[int, Break] = {}
+        self.is_pristine = True
+        self.x = np.zeros((2, frame.width))
+        self.common = np.zeros(frame.border)
+        self.linear = LinearRows(frame.width, frame.border)
+        self._dirty: set[int] = {first}
+        self._touched = True
+        self._prior, self._prior_target = self._first_prior()
+        self.loss = RobustLoss(frame.setup.options.loss)
+
+    @classmethod
+    def of(
+        cls,
+        frame: Frame,
+        buffer: Buffer,
+        first: int,
+        x: FloatArray,
+        common: FloatArray,
+        prior: tuple[FloatArray, FloatArray],
+    ) -> Window:
+        """A window from its parts; its rows are made of the buffer's records."""
+        window = cls(frame, buffer, first)
+        window.linear.append(len(x) - 2)
+        window.x, window.common, window.count = x, common, len(x)
+        window._prior, window._prior_target = prior
+        window.touch_all()
+        return window
+
+    # -- what it is --
+
+    @property
+    def times(self) -> FloatArray:
+        """Node times, s."""
+        return grid(self.first, self.count, self.frame.spacing)
+
+    @property
+    def end(self) -> float:
+        """Time of the last node, s."""
+        return self.frame.spacing * (self.first + self.count - 1)
+
+    @property
+    def begin(self) -> float:
+        """Time of the first node, s."""
+        return self.frame.spacing * self.first
+
+    @property
+    def layout(self) -> Layout:
+        """Columns of the nodes as they are now."""
+        return self.frame.layout(self.times)
+
+    @property
+    def vector(self) -> FloatArray:
+        """All unknowns, flat."""
+        return np.concatenate([self.x.ravel(), self.common])
+
+    def put(self, vector: FloatArray) -> None:
+        """Take over a solver's answer, a flat vector."""
+        self._touched = False
+        inner = self.count * self.frame.width
+        self.x, self.common = vector[:inner].reshape(self.count, -1).copy(), vector[inner:].copy()
+
+    @property
+    def prior(self) -> tuple[FloatArray, FloatArray]:
+        """Rows (P, K) over the first nodes and what is shared, and their right-hand sides."""
+        return self._prior, self._prior_target
+
+    @property
+    def is_dirty(self) -> bool:
+        """Whether intervals wait for their rows."""
+        return bool(self._dirty)
+
+    @property
+    def is_first_dirty(self) -> bool:
+        """Whether the first interval waits for its rows."""
+        return self.first in self._dirty
+
+    @property
+    def is_touched(self) -> bool:
+        """Whether records have come since a solver put its answer: nodes may have to move."""
+        return self._touched
+
+    # -- how it changes --
+
+    def touch(self, begin: float, end: float) -> None:
+        """Records from `begin` to `end` (s) have changed: their intervals are made anew."""
+        h = self.frame.spacing
+        low = max(slot_of(begin, h), self.first)
+        high = min(slot_of(end, h), self.first + self.count - 2)
+        self._dirty.update(range(low, high + 1))
+        self._touched = True
+
+    def touch_all(self) -> None:
+        """All intervals are made anew."""
+        self._dirty.update(range(self.first, self.first + self.count - 1))
+        self._touched = True
+
+    def extend(self, t: float) -> None:
+        """Add nodes until one stands behind `t` (s), where the motion prior expects them."""
+        more = slot_of(t, self.frame.spacing) + 2 - self.first - self.count
+        if more <= 0:
+            return
+        last = self.first + self.count - 1
+        dt = grid(1, more, self.frame.spacing)
+        self.x = np.concatenate([self.x, self.predicted(self.x[-1], dt)])
+        self.linear.append(more)
+        self._dirty.update(range(last, last + more))
+        self.count += more
+
+    def predicted(self, node: FloatArray, dt: FloatArray) -> FloatArray:
+        """A node's unknowns (W,) carried ahead by times `dt` (M,), s: (M, W)."""
+        return node @ np.swapaxes(self.carried(dt), 1, 2)
+
+    def carried(self, dt: FloatArray) -> FloatArray:
+        """Transition of a node's unknowns over times `dt` (M,), s: (M, W, W)."""
+        frame, n = self.frame, self.frame.order
+        out = np.broadcast_to(np.eye(frame.width), (len(dt), frame.width, frame.width)).copy()
+        phi = transition(n, dt)
+        for axis in range(3):
+            own = axis + 3 * np.arange(n)
+            out[:, own[:, None], own[None, :]] = phi
+        slow = dict(frame.slow)
+        if "clock_drift" in slow:
+            layout = frame.layout(np.zeros(1))
+            offset, drift = (
+                int(layout.node_columns(name, np.zeros(1, dtype=np.int64))[0, 0])
+                for name in ("clock_offset", "clock_drift")
+            )
+            out[:, offset, drift] = dt * layout.unit("clock_drift") / layout.unit("clock_offset")
+        return out
+
+    def refresh(self) -> set[int]:
+        """Make the rows of changed intervals anew; which they were."""
+        changed = set(self._dirty)
+        for begin, count in _runs(self._dirty):
+            rows, targets = interval_rows(self.frame, self._buffer, begin, count, self.breaks)
+            at = slice(begin - self.first, begin - self.first + count)
+            self.linear.put(at, rows, targets)
+        self._dirty.clear()
+        return changed
+
+    def drop(self, pings: Sequence[RowsOf]) -> None:
+        """Eliminate the first node.
+
+        Parameters
+        ----------
+        pings : sequence of RowsOf
+            The rows of pings that touch its interval.
+        """
+        self.is_pristine = False
+        frame = self.frame
+        w, b = frame.width, frame.border
+        parts = [self._prior_rows(), (self.linear.rows[0], self.linear.targets[0], 2)]
+        parts += [self._near_rows(rows) for rows in pings]
+        nodes = max(part[2] for part in parts)
+        size = nodes * w + b
+        stacked: list[FloatArray] = []
+        for rows, target, reach in parts:
+            whole = np.zeros((len(rows), size + 1))
+            whole[:, : reach * w] = rows[:, : reach * w]
+            whole[:, nodes * w : size] = rows[:, reach * w :]
+            whole[:, -1] = target
+            stacked.append(whole)
+        # What stands below the node's own rows does not speak of it.
+        rest = triangle(np.concatenate(stacked))[w:size, w:]
+        self._prior, self._prior_target = rest[:, :-1], rest[:, -1]
+        self.first, self.count = self.first + 1, self.count - 1
+        self.x = self.x[1:]
+        self.linear.drop()
+        self._dirty.discard(self.first - 1)
+        self.breaks.pop(self.first - 1, None)
+
+    def leap(self, slot: int) -> None:
+        """Carry the prior of a single node that is left to one far ahead, nothing in between."""
+        frame, ahead = self.frame, (slot - self.first) * self.frame.spacing
+        layout = frame.layout(np.array([0.0, ahead]))
+        blocks = Builder(frame.setup, layout).silent_blocks(layout.chains[0])
+        w, size = frame.width, layout.size
+        prior = np.zeros((len(self._prior), size + 1))
+        prior[:, :w], prior[:, 2 * w : size] = self._prior[:, :w], self._prior[:, w:]
+        prior[:, -1] = self._prior_target
+        rows = [_dense(block, size) for block in blocks]
+        rest = triangle(np.concatenate([prior, *rows]))[w:size, w:]
+        self._prior, self._prior_target = rest[:, :-1], rest[:, -1]
+        start = self.predicted(self.x[0], np.array([ahead]))[0]
+        self.first, self.count = slot, 2
+        self.x = np.stack([start, self.predicted(start, np.array([frame.spacing]))[0]])
+        self.linear = LinearRows(frame.width, frame.border)
+        self.breaks.clear()
+        self._dirty = {slot}
+
+    def shift(self, slots: int) -> None:
+        """Move all nodes by so many places: the clock was set."""
+        self.first += slots
+        self._dirty = {k + slots for k in self._dirty}
+        self.breaks = {k + slots: jump for k, jump in self.breaks.items()}
+
+    def reframe(self, frame: Frame) -> None:
+        """Take in further unknowns, with what is known of them beforehand."""
+        before, after = self.layout, frame.layout(self.times)
+        old_x, old_prior, old_target = self.vector, self._prior, self._prior_target
+        old_nodes = (old_prior.shape[1] - self.frame.border) // self.frame.width
+        vector = np.zeros(after.size)
+        names = [*KINEMATIC[: frame.order], *(name for name, _ in self.frame.slow)]
+        for name in (*names, *(name for name, _ in self.frame.shared)):
+            after.put(vector, name, before.get(old_x, name))
+        first, shared = (
+            self._columns_among(before, old_nodes),
+            self._columns_among(after, old_nodes),
+        )
+        size = old_nodes * frame.width + frame.border
+        rows = np.zeros((len(old_prior), size + 1))
+        rows[:, [shared[key] for key in first]] = old_prior[:, list(first.values())]
+        rows[:, -1] = old_target
+        self.frame = frame
+        fresh = [
+            _embedded(block, after, old_nodes)
+            for block in self._prior_blocks()
+            if not set(np.unique(block.columns)) & self._taken(before, after)
+        ]
+        stacked = np.concatenate([rows, *fresh])
+        if len(stacked) > size:
+            stacked = triangle(stacked)[:size]
+        self._prior, self._prior_target = stacked[:, :-1], stacked[:, -1]
+        self.put(vector)
+        self.linear = LinearRows(frame.width, frame.border)
+        self.linear.append(self.count - 2)
+        self.touch_all()
+
+    def regap(self, gap: float) -> None:
+        """Let velocities join over another gap (s)."""
+        self.frame = replace(self.frame, gap=gap)
+        self.touch_all()
+
+    # -- what a solver sees --
+
+    def ranges(self, pings: Sequence[Entry]) -> list[RangeBlock]:
+        """Residuals of pings, two-way and one-way, over the window's columns."""
+        layout = self.layout
+        builder = Builder(self.frame.setup, layout)
+        out: list[RangeBlock] = []
+        for kind in PINGS:
+            some = [e for e in pings if e.kind == kind]
+            if some:
+                records = columns_of(kind, some)
+                lever = self._levers(builder, some, records)
+                out.append(builder.range_block(layout.chains[0], records, lever))
+        return out
+
+    def usable(self) -> list[Entry]:
+        """Pings that count: inside the window, not gated, with an attitude where that is needed."""
+        waits = not self.frame.setup.vehicle.transducer.is_zero and not self._buffer.of("attitude")
+        if waits:
+            return []
+        begin, end = self.begin - 1e-9, self.end + 1e-9
+        return [
+            e
+            for kind in PINGS
+            for e in self._buffer.of(kind)
+            if not e.gated and e.begin >= begin and e.t <= end
+        ]
+
+    def equations(self, ranges: Sequence[RangeBlock]) -> WindowEquations:
+        """The window's equations with some range blocks."""
+        frame = self.frame
+        return WindowEquations(
+            frame.width, frame.border, self.linear, self.prior, ranges, self.loss
+        )
+
+    def interval_row(self, k: int) -> LinearBlock:
+        """The rows of the interval after node number `k` as a block over the window's columns."""
+        at, w = k - self.first, self.frame.width
+        columns = np.concatenate([at * w + np.arange(2 * w), self._shared_columns()])
+        rows, targets = self.linear.rows[at], self.linear.targets[at]
+        return LinearBlock("interval", columns[None], rows[None], targets[None])
+
+    def prior_row(self) -> LinearBlock:
+        """The prior's rows as a block over the window's columns."""
+        nodes = (self._prior.shape[1] - self.frame.border) // self.frame.width
+        own = np.arange(nodes * self.frame.width)
+        columns = np.concatenate([own, self._shared_columns()])
+        return LinearBlock("past", columns[None], self._prior[None], self._prior_target[None])
+
+    def _shared_columns(self) -> IntArray:
+        return self.count * self.frame.width + np.arange(self.frame.border)
+
+    # -- inside --
+
+    def _levers(self, builder: Builder, some: Sequence[Entry], records: object) -> FloatArray:
+        """Transducer's lever arms in world axes."""
+        legs = 2 if some[0].kind == "two_way_range" else 1
+        if self.frame.setup.vehicle.transducer.is_zero:
+            return np.zeros((len(some), legs, 3))
+        track = attitude_over(self._buffer, min(e.begin for e in some), max(e.t for e in some))
+        assert track is not None
+        return builder.transducer_levers(track, records)  # pyright: ignore[reportArgumentType]
+
+    def _prior_blocks(self) -> list[LinearBlock]:
+        """What is known of the first node and of what is shared before any measurement."""
+        builder = Builder(self.frame.setup, self.layout)
+        chain = self.layout.chains[0]
+        blocks = [*builder.first_priors(chain), *builder.shared_priors(self.frame.lasting)]
+        return [b for b in blocks if isinstance(b, LinearBlock)]
+
+    def _first_prior(self) -> tuple[FloatArray, FloatArray]:
+        rows = np.concatenate([_embedded(b, self.layout, 1) for b in self._prior_blocks()])
+        return rows[:, :-1], rows[:, -1]
+
+    def _prior_rows(self) -> tuple[FloatArray, FloatArray, int]:
+        nodes = (self._prior.shape[1] - self.frame.border) // self.frame.width
+        return self._prior, self._prior_target, nodes
+
+    def _near_rows(self, pings: RowsOf) -> tuple[FloatArray, FloatArray, int]:
+        """Linearised pings as rows over the first nodes and what is shared."""
+        w, b, inner = self.frame.width, self.frame.border, self.count * self.frame.width
+        columns, slope = pings.columns, pings.slope
+        inside = (columns >= 0) & (columns < inner)
+        nodes = int(np.where(inside, columns, 0).max(initial=0)) // w + 1
+        local = np.where(columns < inner, columns, columns - inner + nodes * w)
+        local = np.where(columns < 0, nodes * w + b, local)
+        m = len(slope)
+        size = nodes * w + b + 1
+        flat = (np.arange(m)[:, None] * size + local).ravel()
+        sums: Any = np.bincount(flat, slope.ravel(), minlength=m * size)
+        whole = sums.reshape(m, size)[:, :-1]
+        x = np.concatenate([self.x[:nodes].ravel(), self.common])
+        return whole, whole @ x - pings.residual, nodes
+
+    @staticmethod
+    def _columns_among(layout: Layout, nodes: int) -> dict[tuple[str, int, int], int]:
+        """Place in a prior's row of each column of the first nodes and of what is shared."""
+        places: dict[tuple[str, int, int], int] = {}
+        behind = (layout.node_count - nodes) * layout.node_width
+        for variable in layout.variables:
+            inside = variable.column < nodes * layout.node_width
+            if inside or variable.name in dict(layout.shared):
+                at = variable.column - (0 if inside else behind)
+                for i in range(variable.size):
+                    places[variable.name, variable.index, i] = at + i
+        return places
+
+    @staticmethod
+    def _taken(before: Layout, after: Layout) -> set[int]:
+        """Columns of the new layout's first node and shared states that the old one had."""
+        names = {v.name for v in before.variables}
+        taken: set[int] = set()
+        for v in after.variables:
+            if v.name in names:
+                taken.update(range(v.column, v.column + v.size))
+        return taken
+
+
+def _dense(block: Block, size: int) -> FloatArray:
+    """Rows of a linear block over all columns, right-hand side behind them."""
+    assert isinstance(block, LinearBlock)
+    m, r, _ = block.matrix.shape
+    out = np.zeros((m, r, size + 2))
+    columns = np.where(block.columns < 0, size + 1, block.columns)
+    out[np.arange(m)[:, None, None], np.arange(r)[None, :, None], columns[:, None, :]] = (
+        block.matrix
+    )
+    out[:, :, size] = block.target
+    return out[:, :, : size + 1].reshape(m * r, -1)
+
+
+def _embedded(block: LinearBlock, layout: Layout, nodes: int) -> FloatArray:
+    """Rows of a block over the first nodes and what is shared, right-hand side behind them."""
+    rows = _dense(block, layout.size)
+    inner = layout.node_count * layout.node_width
+    return np.delete(rows, np.s_[nodes * layout.node_width : inner], axis=1)
+
+
+def _runs(numbers: Iterable[int]) -> list[tuple[int, int]]:
+    """Runs of consecutive numbers: first and count of each."""
+    runs: list[tuple[int, int]] = []
+    for k in sorted(numbers):
+        if runs and k == runs[-1][0] + runs[-1][1]:
+            runs[-1] = (runs[-1][0], runs[-1][1] + 1)
+        else:
+            runs.append((k, 1))
+    return runs
+
+
+def frame_of(
+    setup: Setup, kinds: Iterable[str], lasting: float, gap: float, spacing: float
+) -> Frame:
+    """The unknowns that the kinds of records seen so far ask for.
+
+    Parameters
+    ----------
+    setup : Setup
+        Options and beacons.
+    kinds : iterable of str
+        Record kinds; "water" and "bottom" for velocities.
+    lasting : float
+        Standard deviation of the heading reference's lasting error, rad.
+    gap : float
+        Longest gap that velocities bridge, s.
+    spacing : float
+        Of the nodes, s.
+    """
+    seen = set(kinds)
+    options = setup.options
+    slow: list[tuple[str, int]] = []
+    if options.estimate_sound_speed and setup.beacons:
+        slow.append(("sound_speed", 1))
+    if "one_way_range" in seen:
+        slow += [("clock_offset", 1), ("clock_drift", 1)]
+    if "water" in seen:
+        slow.append(("current", 2))
+    odometry = bool({"water", "bottom"} & seen)
+    shared = shared_states(setup, lasting if odometry else None)
+    return Frame(setup, spacing, order_of(options), tuple(slow), shared, lasting, gap)
