@@ -1,4 +1,4 @@
-"""Measure the solvers against GTSAM, scipy and a Kalman filter: ratios, in one run, in turns.
+"""Measure solvers and online estimator against GTSAM, scipy and a Kalman filter, in turns.
 
 A ratio is our time over theirs; seconds depend on the machine, ratios hardly do. Every timed pair
 that solves the same problem must give the same positions, or the run fails. What is timed on
@@ -7,6 +7,8 @@ either side stands in docs/performance.md.
     python scripts/benchmark.py                     # table, and the figure of the docs
     python scripts/benchmark.py --quick --gate      # exit status 1 where a limit is exceeded
     python scripts/benchmark.py --update-baseline   # measure anew what --gate compares with
+    python scripts/benchmark.py --write-docs        # put that into the page's tables
+    python scripts/benchmark.py --only online       # one part, with any of the first three
 """
 
 from __future__ import annotations
@@ -23,14 +25,16 @@ import argparse
 import ctypes
 import json
 import platform
+import re
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import benchmark_online as online
 import benchmark_problems as problems
 import benchmark_rivals as rivals
 import numpy as np
@@ -38,6 +42,7 @@ import numpy as np
 HERE = Path(__file__).resolve().parent
 BASELINE = HERE / "benchmark_baseline.json"
 FIGURE = HERE.parent / "docs" / "scaling.png"
+PAGE = HERE.parent / "docs" / "performance.md"
 #: A ratio fails where it is so many times the baseline's,
 SLACK = 1.5
 #: or above these, by name and number of nodes.
@@ -46,6 +51,7 @@ LIMITS: dict[str, dict[str, float]] = {
     "full_vs_wrapped_gtsam": {"4000": 0.06},
     "marginals_vs_gtsam": {"5000": 0.1},
     "gtsam_vs_plain_custom": {"4000": 0.05},
+    "online_vs_plain_custom": {"60": 0.2, "200": 0.2, "500": 0.2},
 }
 #: At the largest size of the scaling, time and memory are less than this, s and MB;
 LARGEST, MOST_SECONDS, MOST_MB = 100_000, 4.0, 1000.0
@@ -65,6 +71,9 @@ TITLES = {
     "gtsam_vs_plain_custom": "GTSAM, our factors / plain custom",
     "banded_vs_scipy": "banded / scipy least_squares",
     "banded_vs_kalman": "banded / Kalman filter + RTS",
+    "online_vs_plain_custom": "online p99, lm / GTSAM, plain",
+    "online_vs_plain_one_update": "online p99, lm / plain, one update",
+    "online_lm_vs_isam2": "online p99, lm / isam2",
 }
 
 
@@ -85,6 +94,8 @@ class Plan:
         Nodes and repeats of the other comparisons.
     scaling : dict of int to int
         Nodes and repeats of what runs in a process of its own.
+    online : dict of int to online.Contest
+        Nodes in the window, and the updates of the online estimator and its rivals.
     """
 
     races: Mapping[int, int]
@@ -96,9 +107,17 @@ class Plan:
     scipy: Mapping[int, int]
     kalman: Mapping[int, int]
     scaling: Mapping[int, int]
+    online: Mapping[int, online.Contest]
+
+    def only_online(self) -> Plan:
+        """The same with nothing but the online estimator."""
+        others = ("races", "native", "plain", "full", "marginals", "scipy", "kalman", "scaling")
+        return replace(self, **{name: {} for name in others})
 
 
 SIZES = (1000, 2000, 5000, 10_000, 20_000, 50_000, LARGEST)
+#: Nodes in the online estimator's window.
+WINDOWS = (60, 200, 500)
 FULL = Plan(
     races={1000: 9, 2000: 9, 4000: 5, 5000: 7, 10_000: 5, 20_000: 5},
     reported={
@@ -113,6 +132,13 @@ FULL = Plan(
     scipy={1000: 5},
     kalman={5000: 5},
     scaling=dict.fromkeys(SIZES, 5),
+    online={
+        nodes: online.Contest(
+            {"lm": 10_000, "isam2": 3000, "isam2_plain_custom": 3000, online.ONE_UPDATE: 10_000},
+            rest=nodes,
+        )
+        for nodes in WINDOWS
+    },
 )
 QUICK = Plan(
     races={1000: 9, 2000: 7, 4000: 3, 5000: 5, 10_000: 3, 20_000: 3},
@@ -124,6 +150,12 @@ QUICK = Plan(
     scipy={1000: 5},
     kalman={5000: 3},
     scaling=dict.fromkeys(SIZES, 3),
+    online={
+        nodes: online.Contest(
+            {"lm": 1000, "isam2": 300, "isam2_plain_custom": 300, online.ONE_UPDATE: 1000}, rest=60
+        )
+        for nodes in WINDOWS
+    },
 )
 
 
@@ -168,6 +200,13 @@ def measure(plan: Plan) -> tuple[dict[str, Any], list[rivals.Pair]]:
     keep_freed_memory()
     # The largest graphs come last: the holes that they leave in the heap slow down what follows.
     pairs: list[rivals.Pair] = []
+    latency: dict[str, dict[str, Any]] = {name: {} for name in online.LISTED}
+    for nodes, contest in plan.online.items():
+        say(f"online, {nodes} nodes")
+        timed, found = online.compete(nodes, contest)
+        pairs += found
+        for name, leaves in latency.items():
+            leaves[str(nodes)] = timed[name].leaf
     others = {
         rivals.compare_scipy: plan.scipy,
         rivals.compare_kalman: plan.kalman,
@@ -195,6 +234,7 @@ def measure(plan: Plan) -> tuple[dict[str, Any], list[rivals.Pair]]:
         if pair.nodes in plan.reported.get(pair.name, (pair.nodes,)):
             report[pair.name][str(pair.nodes)] = pair.ratio
     report |= {"scaling": scaling, "native_scaling": native, "wrapped_scaling": wrapped}
+    report["online"] = latency
     report["pairs"] = [asdict(pair) | {"ratio": pair.ratio} for pair in pairs]
     report["versions"] = {"python": platform.python_version()} | {
         name: version(name) for name in ("gtsam", "numpy", "scipy")
@@ -270,17 +310,38 @@ def show(report: Mapping[str, Any], pairs: Sequence[rivals.Pair]) -> None:
             f"{'' if pair.difference is None else f'{pair.difference:.1e}':>10}  {pair.note}"
         )
     print("\nDifference: of positions, m; of covariances, relative.\n")
+    show_latency(report["online"])
+    if report["scaling"]:
+        show_scaling(report["scaling"])
+
+
+def show_latency(latency: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> None:
+    """Print the online estimator's table."""
+    print(
+        f"{'online':<20} {'nodes':>6} {'p50, ms':>9} {'p99, ms':>9} {'max, ms':>9} {'updates':>8}"
+    )
+    for name, sizes in latency.items():
+        for nodes, leaf in sizes.items():
+            print(
+                f"{name:<20} {nodes:>6} {leaf['p50_ms']:9.3f} {leaf['p99_ms']:9.3f} "
+                f"{leaf['max_ms']:9.3f} {leaf['updates']:8d}"
+            )
+    print()
+
+
+def show_scaling(rows: Sequence[Mapping[str, Any]]) -> None:
+    """Print the scaling's table."""
     print(
         f"{'nodes':>7} {'build, s':>9} {'solve, s':>9} {'cov., s':>9} {'both, s':>9} "
         f"{'us/node':>8} {'peak, MB':>9}"
     )
-    for row in report["scaling"]:
+    for row in rows:
         print(
             f"{row['nodes']:7d} {row['build_seconds']:9.4f} {row['solve_seconds']:9.4f} "
             f"{row['covariance_seconds']:9.4f} {row['seconds']:9.4f} "
             f"{1e6 * row['seconds'] / row['nodes']:8.2f} {row['peak_mb'] or np.nan:9.0f}"
         )
-    steady = flatness(report["scaling"])
+    steady = flatness(rows)
     if steady is not None:
         print(f"From {FLAT_FROM} nodes on: largest over smallest time per node {steady:.2f}")
 
@@ -316,18 +377,62 @@ def draw(report: Mapping[str, Any], path: Path) -> None:
     figure.savefig(path, dpi=150)
 
 
-def baseline_of(report: Mapping[str, Any]) -> dict[str, dict[str, float]]:
-    """A report's ratios, to three digits."""
-    return {
-        name: {nodes: float(f"{ratio:.3g}") for nodes, ratio in report[name].items()}
-        for name in TITLES
+def baseline_of(report: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """A report's ratios and the online estimator's latencies, to three digits."""
+    ratios = {
+        name: {nodes: _rounded(ratio) for nodes, ratio in report[name].items()} for name in TITLES
     }
+    return ratios | {
+        "online": {
+            name: {
+                nodes: {what: _rounded(x) for what, x in leaf.items()}
+                for nodes, leaf in sizes.items()
+            }
+            for name, sizes in report["online"].items()
+        }
+    }
+
+
+def _rounded(x: float) -> float:
+    """To three digits; counts stay whole."""
+    return x if isinstance(x, int) else float(f"{x:.3g}")
+
+
+def update_baseline(report: Mapping[str, Any], part: str | None) -> None:
+    """Write a report's baseline, or of one part; the others stay as they are."""
+    fresh = baseline_of(report)
+    if part is not None:
+        old = json.loads(BASELINE.read_text())
+        fresh = old | {name: sizes for name, sizes in fresh.items() if name.startswith(part)}
+    BASELINE.write_text(json.dumps(fresh, indent=2) + "\n")
+
+
+def with_numbers(page: str, baseline: Mapping[str, Any]) -> str:
+    """The docs' page with a baseline's numbers in its tables."""
+
+    def ratio_row(found: re.Match[str]) -> str:
+        ratio = baseline[found["name"]][found["nodes"].replace(" ", "")]
+        return f"{found['head']}{ratio:g}{found['tail']}"
+
+    def latency_row(found: re.Match[str]) -> str:
+        leaves = [baseline["online"][name][found["nodes"]] for name in online.LISTED]
+        cells = [f"{x['p50_ms']:g} / {x['p99_ms']:g} / {x['max_ms']:g}" for x in leaves]
+        return " | ".join([f"| {found['nodes']}", *cells]) + " |"
+
+    ratio = (
+        r"^(?P<head>\| `(?P<name>\w+)` \|.*\| (?P<nodes>[\d ]+) \| )[\d.]+(?P<tail> \| [\d.]* *\|)$"
+    )
+    page = re.sub(ratio, ratio_row, page, flags=re.M)
+    return re.sub(
+        r"^\| (?P<nodes>\d+) \|(?: [\d./ ]+ / [\d./ ]+ \|){3}$", latency_row, page, flags=re.M
+    )
 
 
 def main(arguments: Sequence[str] | None = None, plan: Plan | None = None) -> int:
     """Run, print, write, and judge."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="fewer repeats: some two minutes")
+    parser.add_argument("--quick", action="store_true", help="fewer repeats: some three minutes")
+    parser.add_argument("--only", choices=("online",), help="run this part alone")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all numbers here")
     parser.add_argument("--figure", type=Path, metavar="PNG", help="where the scaling figure goes")
     parser.add_argument("--no-figure", action="store_true", help="draw none")
@@ -335,14 +440,20 @@ def main(arguments: Sequence[str] | None = None, plan: Plan | None = None) -> in
     after = parser.add_mutually_exclusive_group()
     after.add_argument("--gate", action="store_true", help="fail where a limit is exceeded")
     after.add_argument("--update-baseline", action="store_true", help=f"write {BASELINE.name}")
+    after.add_argument("--write-docs", action="store_true", help=f"fill {PAGE.name}, run nothing")
     given = parser.parse_args(arguments)
     if given.scaling_row:
         print(json.dumps(problems.scaling_row(*given.scaling_row)))
         return 0
+    if given.write_docs:
+        page = with_numbers(PAGE.read_text("utf-8"), json.loads(BASELINE.read_text()))
+        PAGE.write_text(page, "utf-8")
+        return 0
     for path in (given.json, given.figure):
         if path and not path.resolve().parent.is_dir():
             parser.error(f"{path}: there is no such folder; make it first")
-    report, pairs = measure(plan or (QUICK if given.quick else FULL))
+    plan = plan or (QUICK if given.quick else FULL)
+    report, pairs = measure(plan.only_online() if given.only else plan)
     show(report, pairs)
     failed = disagreements(pairs)
     if given.gate:
@@ -350,9 +461,9 @@ def main(arguments: Sequence[str] | None = None, plan: Plan | None = None) -> in
     if given.json:
         given.json.write_text(json.dumps(report, indent=2) + "\n")
     if given.update_baseline and not failed:
-        BASELINE.write_text(json.dumps(baseline_of(report), indent=2) + "\n")
+        update_baseline(report, given.only)
     figure = given.figure or (FIGURE if FIGURE.parent.is_dir() else None)
-    if figure and not given.no_figure:
+    if figure and report["scaling"] and not given.no_figure:
         draw(report, figure)
     for line in failed:
         print(f"FAILED {line}")

@@ -12,12 +12,14 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import gtsam
 import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
 
 import benchmark as script
+import benchmark_online as online
 import benchmark_problems as problems
 import benchmark_rivals as rivals
 
@@ -27,6 +29,9 @@ BASELINE = json.loads(script.BASELINE.read_text())
 SLACK = 2.0
 NODES = 5000
 SMALL = 60
+#: A window, and a contest in it.
+WINDOW = 20
+CONTEST = online.Contest(dict.fromkeys((*online.LISTED, online.SETTLED), 8), rest=4)
 TINY = script.Plan(
     races={SMALL: 1},
     reported={},
@@ -37,9 +42,10 @@ TINY = script.Plan(
     scipy={SMALL: 1},
     kalman={SMALL: 1},
     scaling={SMALL: 1},
+    online={WINDOW: CONTEST},
 )
 #: One pair of each kind that compares answers, and no process of its own.
-PAIRS = replace(TINY, native={}, plain={}, kalman={}, scaling={})
+PAIRS = replace(TINY, native={}, plain={}, kalman={}, scaling={}, online={})
 
 
 @pytest.fixture(autouse=True)
@@ -55,7 +61,8 @@ def test_the_script_writes_what_it_promises(tmp_path, capsys):
     assert script.main(arguments, TINY) == 0
     report = json.loads(written.read_text())
     for name in script.TITLES:
-        assert report[name][str(SMALL)] > 0.0, name
+        size = WINDOW if name.startswith("online") else SMALL
+        assert report[name][str(size)] > 0.0, name
     (row,) = report["scaling"]
     assert row["nodes"] == SMALL
     assert row["seconds"] == pytest.approx(row["solve_seconds"] + row["covariance_seconds"])
@@ -100,7 +107,7 @@ def test_a_run_that_fails_leaves_the_baseline(monkeypatch, tmp_path):
     assert script.main(["--no-figure", "--update-baseline"], PAIRS) == 0
     before = json.loads(script.BASELINE.read_text())
     assert before["banded_vs_scipy"].keys() == {"60"}
-    assert before.keys() == script.TITLES.keys()
+    assert before.keys() == {*script.TITLES, "online"}
     script.BASELINE.write_text("{}")
     monkeypatch.setattr(rivals, "by_scipy", lambda case: case.start)
     assert script.main(["--no-figure", "--update-baseline"], PAIRS) == 1
@@ -146,9 +153,18 @@ def test_the_filter_finds_the_track():
     assert (np.linalg.eigvalsh(covariance) > 0.0).all()
 
 
+def limit(name, nodes):
+    """A ratio's limit, infinite where it has none."""
+    found = script.limit_of(name, nodes)
+    return np.inf if found is None else found
+
+
 def report_of(**changes):
     """A report that passes any gate, with some of its ratios changed."""
-    ratios = {name: {nodes: 0.9 * r for nodes, r in BASELINE[name].items()} for name in BASELINE}
+    ratios = {
+        name: {nodes: min(0.9 * r, limit(name, nodes)) for nodes, r in BASELINE[name].items()}
+        for name in script.TITLES
+    }
     for name, values in changes.items():
         ratios[name] = ratios[name] | values
     row = {"seconds": 0.05, "peak_mb": 200.0}
@@ -174,7 +190,7 @@ def test_the_gate_wants_a_baseline_for_every_ratio():
 @pytest.mark.parametrize("name", script.LIMITS)
 def test_the_gate_has_limits_of_its_own(name):
     nodes, limit = next(iter(script.LIMITS[name].items()))
-    lenient = {n: dict.fromkeys(BASELINE[n], 100.0) for n in BASELINE}
+    lenient = {n: dict.fromkeys(BASELINE[n], 100.0) for n in script.TITLES}
     (line,) = script.excesses(report_of(**{name: {nodes: 1.01 * limit}}), lenient)
     assert line.endswith(f"limit {limit:.4g}")
 
@@ -208,7 +224,11 @@ def test_both_plans_measure_what_the_gate_judges(plan):
         "banded_vs_scipy": {str(n) for n in plan.scipy},
         "banded_vs_kalman": {str(n) for n in plan.kalman},
     }
-    assert {name: set(sizes) for name, sizes in BASELINE.items()} == measured
+    measured |= {n: {str(k) for k in plan.online} for n in script.TITLES if n.startswith("online")}
+    assert {name: set(BASELINE[name]) for name in script.TITLES} == measured
+    assert {name: set(sizes) for name, sizes in BASELINE["online"].items()} == {
+        name: {str(k) for k in plan.online} for name in online.LISTED
+    }
     assert all(set(sizes) <= measured[name] for name, sizes in script.LIMITS.items())
     assert all(n in plan.races for sizes in plan.reported.values() for n in sizes)
     assert {script.FLAT_FROM, script.LARGEST} <= plan.scaling.keys()
@@ -225,9 +245,119 @@ def test_the_docs_show_the_baseline():
     rows = re.findall(r"^\| `(\w+)` \|.*\| ([\d ]+) \| ([\d.]+) \| ([\d.]*) *\|$", page, re.M)
     shown = {(name, nodes.replace(" ", "")): float(ratio) for name, nodes, ratio, _ in rows}
     limits = {(name, nodes.replace(" ", "")): float(x) for name, nodes, _, x in rows if x}
-    flat = {(n, nodes): ratio for n, sizes in BASELINE.items() for nodes, ratio in sizes.items()}
+    flat = {(n, nodes): x for n in script.TITLES for nodes, x in BASELINE[n].items()}
     assert shown == flat
     assert limits == {(n, k): x for n, sizes in script.LIMITS.items() for k, x in sizes.items()}
+
+
+def test_the_docs_show_the_latencies():
+    page = (ROOT / "docs" / "performance.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (\d+) \| (.+ / .+) \| (.+ / .+) \| (.+ / .+) \|$", page, re.M)
+    assert [nodes for nodes, *_ in rows] == [str(n) for n in script.WINDOWS]
+    for nodes, *cells in rows:
+        for name, cell in zip(online.LISTED, cells, strict=True):
+            leaf = BASELINE["online"][name][nodes]
+            shown = [float(x) for x in cell.split(" / ")]
+            assert shown == [leaf["p50_ms"], leaf["p99_ms"], leaf["max_ms"]], (name, nodes)
+
+
+def test_the_baseline_is_written_into_the_docs(monkeypatch, tmp_path):
+    page, copy, other = (
+        script.PAGE.read_text("utf-8"),
+        tmp_path / "page.md",
+        tmp_path / "other.json",
+    )
+    copy.write_text(page, "utf-8")
+    other.write_text(re.sub(r"(?<=: )[\d.]+", "7.5", script.BASELINE.read_text()))
+    with monkeypatch.context() as patched:
+        patched.setattr(script, "PAGE", copy)
+        patched.setattr(script, "BASELINE", other)
+        assert script.main(["--write-docs"]) == 0
+    sevens = copy.read_text("utf-8")
+    assert sevens.count(" 7.5 ") == 9 * len(script.WINDOWS) + sum(
+        len(BASELINE[name]) for name in script.TITLES
+    )
+    assert script.with_numbers(sevens, BASELINE) == page
+
+
+def test_only_the_online_estimator(monkeypatch, tmp_path, capsys):
+    baseline, written = tmp_path / "baseline.json", tmp_path / "online.json"
+    monkeypatch.setattr(script, "BASELINE", baseline)
+    old = {name: {"60": 7.0} for name in script.TITLES}
+    baseline.write_text(json.dumps(old))
+    arguments = ["--only", "online", "--json", str(written), "--update-baseline"]
+    assert script.main(arguments, TINY) == 0
+    report = json.loads(written.read_text())
+    assert report["online"].keys() == {"lm", "isam2", "isam2_plain_custom"}
+    for sizes in report["online"].values():
+        (leaf,) = sizes.values()
+        assert sizes.keys() == {str(WINDOW)}
+        assert leaf.keys() == {"p50_ms", "p99_ms", "max_ms", "updates"}
+        assert 0.0 < leaf["p50_ms"] <= leaf["p99_ms"] <= leaf["max_ms"]
+        assert leaf["updates"] == 8
+    ours, theirs = (report["online"][name][str(WINDOW)] for name in ("lm", "isam2_plain_custom"))
+    ratio = report["online_vs_plain_custom"][str(WINDOW)]
+    assert ratio == pytest.approx(ours["p99_ms"] / theirs["p99_ms"])
+    assert not report["banded_vs_native"]
+    assert "isam2_plain_custom       20" in capsys.readouterr().out
+    fresh = json.loads(baseline.read_text())
+    assert fresh["banded_vs_native"] == {"60": 7.0}
+    assert fresh["online_vs_plain_custom"].keys() == {str(WINDOW)}
+    assert fresh["online"]["lm"][str(WINDOW)]["updates"] == 8
+
+
+@pytest.fixture(scope="module")
+def contest():
+    """All contestants in a small window."""
+    return online.compete(WINDOW, CONTEST)
+
+
+def test_the_contestants_agree(contest):
+    timed, pairs = contest
+    assert all(pair.agrees for pair in pairs)
+    apart = {pair.name: pair.difference for pair in pairs}
+    assert apart["online_lm_vs_isam2"] < 1e-3
+    assert apart["online_vs_plain_settled"] < 5e-3
+    end = online.circle(np.array([WINDOW + CONTEST.rest + 8.0]))[0]
+    for name, one in timed.items():
+        assert one.positions.shape == (8, 3)
+        assert rivals.farthest(one.positions[-1:], end) < 2.0, name
+
+
+def test_contestants_that_differ_fail_the_run(monkeypatch, capsys):
+    right = online.Ours.newest
+    monkeypatch.setattr(online.Ours, "newest", lambda self: right(self) + 0.1)
+    assert script.main(["--only", "online"], TINY) == 1
+    failed = [line for line in capsys.readouterr().out.splitlines() if line.startswith("FAILED")]
+    assert [line.split()[1] for line in failed] == [
+        "online_vs_plain_custom,",
+        "online_vs_plain_settled,",
+    ]
+
+
+def test_a_ping_a_node():
+    pings = online.pings(600)
+    assert (pings.t_transmit == np.arange(600)).all()
+    assert (pings.t_receive < pings.t_transmit + 1.0).all()
+    sites = np.array([b.position for b in online.BEACONS])[np.arange(600) % 4]
+    ends = (online.circle(t)[0] for t in (pings.t_transmit, pings.t_receive))
+    ways = sum(np.linalg.norm(place - sites, axis=1) for place in ends)
+    noise = (pings.travel_time - ways / online.SPEED) / online.SIGMA
+    assert np.abs(noise).max() < 5.0
+    assert noise.std() == pytest.approx(1.0, abs=0.1)
+
+
+def test_the_rival_is_bare_and_has_the_window_that_was_asked_for():
+    stream = online.pings(WINDOW + 10)
+    plain = online.Plain(WINDOW)
+    assert isinstance(plain.prepare(0, stream[0]), gtsam.CustomFactor)
+    runner = online.Runner(plain, stream)
+    with pytest.raises(RuntimeError, match="the window has 5 nodes, not 20"):
+        runner.warm_up(4)
+    runner.warm_up(WINDOW)
+    assert len(runner.timed.seconds) == 0
+    runner.run(2)
+    assert runner.timed.leaf["updates"] == 2
 
 
 @pytest.fixture(scope="module")

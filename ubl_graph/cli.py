@@ -5,6 +5,7 @@ Bad input ends with one line on standard error and exit code 2; nothing is writt
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Generator
@@ -151,6 +152,8 @@ def live(
 
     {"type": "query", "t": 12.0}
     """
+    # Matrices of a window are small: threads would wait for each other on a busy machine.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from ubl_graph.online.process import serve
 
     serve(config, checkpoint, udp, _warn)

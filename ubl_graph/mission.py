@@ -183,8 +183,11 @@ class Setup:
 
     def beacon_numbers(self, names: FloatArray) -> IntArray:
         """Number in `beacons` of each name, shape (M,); the names are known to be there."""
-        number = {name: i for i, name in enumerate(self.beacon_names)}
-        return np.array([number[str(name)] for name in names], dtype=np.int64)
+        return np.array([self._numbers[str(name)] for name in names], dtype=np.int64)
+
+    @cached_property
+    def _numbers(self) -> dict[str, int]:
+        return {name: i for i, name in enumerate(self.beacon_names)}
 
     @property
     def uses_eigenrays(self) -> bool:

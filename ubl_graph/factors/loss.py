@@ -76,24 +76,31 @@ class RobustLoss:
                 return np.minimum(1.0, 2.0 * c * c / (q + c * c)) ** 2
 
     def curvature(self, r: FloatArray) -> FloatArray:
-        """rho''(r) where that is positive, else 0: what Newton's method weighs a row by."""
+        """What Newton's method weighs a row by: rho''(r), where it is not much below the weight.
+
+        Where it is less than a quarter of that, or negative, the weight itself stands in: a step
+        must not take a far row for one that does not pull.
+        """
+        weight, second = self.weights(r), self._second_derivative(r)
+        return np.where(second > 0.25 * weight, second, weight)
+
+    def _second_derivative(self, r: FloatArray) -> FloatArray:
+        """rho''(r)."""
         c = WIDTHS[self.name]
         q = r * r
+        u = q / (c * c)
         match self.name:
             case "none":
                 return np.ones_like(r)
             case "huber":
-                return (q <= c * c).astype(np.float64)
+                return (u <= 1.0).astype(np.float64)
             case "cauchy":
-                u = q / (c * c)
-                return np.maximum(1.0 - u, 0.0) / (1.0 + u) ** 2
+                return (1.0 - u) / (1.0 + u) ** 2
             case "geman_mcclure":
-                u = q / (c * c)
-                return np.maximum(1.0 - 3.0 * u, 0.0) / (1.0 + u) ** 3
+                return (1.0 - 3.0 * u) / (1.0 + u) ** 3
             case "dcs":
                 phi = c * c
-                outside = 4.0 * phi**2 * (phi - 3.0 * q) / (q + phi) ** 3
-                return np.where(q <= phi, 1.0, np.maximum(outside, 0.0))
+                return np.where(q <= phi, 1.0, 4.0 * phi**2 * (phi - 3.0 * q) / (q + phi) ** 3)
 
     def shaped(self, r: FloatArray) -> FloatArray:
         """sign(r) sqrt(2 rho(r)): half its square is the cost."""

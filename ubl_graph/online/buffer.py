@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right, insort
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -75,6 +75,20 @@ class Entry:
         if self.kind == "velocity":
             return (self.kind, self.t, self.values[-1])
         return (self.kind, self.t)
+
+    @property
+    def stream(self) -> tuple[str, str]:
+        """Whose records come in order: a sensor's, a beacon's, a velocity's by reference."""
+        if self.kind in PINGS:
+            return (self.kind, self.values[0])
+        return (self.kind, self.values[-1] if self.kind == "velocity" else "")
+
+    def equals(self, other: Entry) -> bool:
+        """Whether another entry says the same."""
+        if isinstance(self.record, Start):
+            return self.record == other.record
+        pairs = zip(self.values, other.values, strict=True)
+        return all(np.array_equal(a, b) for a, b in pairs)
 
 
 def entry_of(record: Records | Start) -> Entry:
@@ -157,12 +171,15 @@ class Buffer:
         return [e for e in entries[first:last] if not e.gated]
 
     def neighbours(self, entry: Entry) -> tuple[Entry | None, Entry | None]:
-        """The nearest good entries of the same kind before and after one, itself left out."""
+        """The nearest good entries of the same sensor before and after one, itself left out."""
         entries = self._entries[entry.kind]
         at = bisect_left(entries, entry.t, key=_time)
-        before = next((e for e in reversed(entries[max(at - LOOK, 0) : at]) if not e.gated), None)
-        after = next((e for e in entries[at : at + LOOK] if not e.gated and e is not entry), None)
-        return before, after
+
+        def fits(e: Entry) -> bool:
+            return not e.gated and e is not entry and e.stream == entry.stream
+
+        before = next(filter(fits, reversed(entries[max(at - LOOK, 0) : at])), None)
+        return before, next(filter(fits, entries[at : at + LOOK]), None)
 
     def trim(self, begin: float) -> list[Entry]:
         """Drop what ended before `begin`, but for each kind's last record there; what was dropped.
@@ -186,6 +203,8 @@ class Buffer:
         for entry in self.all():
             entry.t += by
             entry.begin += by
+            if isinstance(entry.record, Start):
+                entry.record = replace(entry.record, t=entry.t)
             names = _COLUMNS.get(entry.kind, ("t",))
             entry.values = (
                 tuple(

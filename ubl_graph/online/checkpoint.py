@@ -110,15 +110,19 @@ def _digest(content: str) -> str:
 
 def _told(estimator: FixedLagEstimator) -> dict[str, Any]:
     core = estimator.core
+    number = {id(e): i for i, e in enumerate(core.tracker.buffer.all())}
     return {
         "setup": _setup_told(estimator.setup),
         "start": None if core.start is None else asdict(core.start),
         "tracker": _tracker_told(core.tracker),
         "clock": {
             "now": core.clock.now,
+            "newest": [[*stream, t] for stream, t in core.clock.newest.items()],
             "held": [_entry_told(e) for e in core.clock.held],
+            "ahead": [i for i, e in enumerate(core.clock.held) if e in core.clock.ahead],
+            "behind": [[_entry_told(e), number.get(id(e))] for e in core.clock.behind],
         },
-        "gates": {kind: _gate_told(gate) for kind, gate in core.gates.items()},
+        "gates": {kind: _gate_told(gate, number) for kind, gate in core.gates.items()},
         "state": _state_told(core.state),
         "latency": {
             "count": core.latency.count,
@@ -136,9 +140,13 @@ def _restored(cls: type[FixedLagEstimator], told: dict[str, Any]) -> FixedLagEst
     core.start = None if told["start"] is None else Start(**told["start"])
     _restore_tracker(core.tracker, told["tracker"])
     core.clock.now = told["clock"]["now"]
+    core.clock.newest = {(kind, name): t for kind, name, t in told["clock"]["newest"]}
+    entries = list(core.tracker.buffer.all())
     core.clock.held = [_entry(e) for e in told["clock"]["held"]]
+    core.clock.ahead = [core.clock.held[i] for i in told["clock"]["ahead"]]
+    core.clock.behind = [_entry(e) if i is None else entries[i] for e, i in told["clock"]["behind"]]
     for kind, gate in told["gates"].items():
-        core.gates[kind] = _gate(gate)
+        core.gates[kind] = _gate(gate, entries)
     for name, value in told["state"].items():
         if name == "moment" and value is not None:
             mean, covariance = np.array(value["mean"]), np.array(value["covariance"])
@@ -217,6 +225,7 @@ def _tracker_told(tracker: Tracker) -> dict[str, Any]:
     told: dict[str, Any] = {
         "entries": [_entry_told(e) for e in tracker.buffer.all()],
         "located": tracker.located,
+        "horizontal_sigma": tracker.horizontal_sigma,
         "rebuilds": tracker.rebuilds,
         "kinds": sorted(tracker.kinds),
         "window": None,
@@ -242,6 +251,7 @@ def _restore_tracker(tracker: Tracker, told: dict[str, Any]) -> None:
         tracker.buffer.add(_entry(entry))
     tracker.located, tracker.rebuilds = told["located"], told["rebuilds"]
     tracker.kinds = set(told["kinds"])
+    tracker.horizontal_sigma = told["horizontal_sigma"]
     window = told["window"]
     if window is None:
         return
@@ -256,8 +266,10 @@ def _restore_tracker(tracker: Tracker, told: dict[str, Any]) -> None:
     )
 
 
-def _gate_told(gate: Gate) -> dict[str, Any]:
+def _gate_told(gate: Gate, number: dict[int, int]) -> dict[str, Any]:
     return {
+        "run": [number[id(e)] for e in gate.run if id(e) in number],
+        "refused": [number[id(e)] for e in gate.refused if id(e) in number],
         "accepted": gate.accepted,
         "rejected": dict(gate.rejected),
         "recent": list(gate.recent),
@@ -266,10 +278,12 @@ def _gate_told(gate: Gate) -> dict[str, Any]:
     }
 
 
-def _gate(told: dict[str, Any]) -> Gate:
+def _gate(told: dict[str, Any], entries: list[Entry]) -> Gate:
     return Gate(
         told["accepted"],
         Counter(told["rejected"]),
+        [entries[i] for i in told["run"]],
+        deque((entries[i] for i in told["refused"]), maxlen=MEMORY),
         recent=deque(told["recent"], maxlen=MEMORY),
         times=deque(told["times"], maxlen=MEMORY),
         surprises=deque(told["surprises"], maxlen=MEMORY),

@@ -9,7 +9,7 @@ from time import perf_counter
 import numpy as np
 
 from ubl_graph.online.buffer import ABSOLUTE, Entry, entry_of
-from ubl_graph.online.clock import LATE
+from ubl_graph.online.clock import MOST_HELD
 from ubl_graph.online.finder import Finder
 from ubl_graph.online.gate import REOPENS, Gate, limit, step_distance
 from ubl_graph.online.outputs import Event, Outcome
@@ -21,6 +21,9 @@ LONGEST_REST = 5.0
 FARTHEST = 3600.0
 #: Before a silence's end records may be out of order by so much, s.
 LEAP_SLACK = 5.0
+#: After a silence of so many seconds and intervals of the most frequent sensor the clock is in
+#: doubt.
+SILENCE, SILENCE_INTERVALS = 1.0, 5.0
 #: Vertical acceleration noise of a vehicle that begins to dive, m^2/s^3.
 DIVE_PSD = 0.05
 #: The step that a clock set back may hide: seconds of way, m, and speed, m/s.
@@ -34,7 +37,8 @@ class Core(Finder):
         """Judge a record by its stamps, then by its values."""
         if self.start is not None and entry.kind != "set_position":
             self._begin_from(entry)
-        if self.clock.is_far(entry):
+        self._begin_clock(entry)
+        if self.clock.is_far(entry, self.gates[entry.kind].interval):
             return self._held_back(entry)
         if self._is_behind(entry):
             return Outcome(not entry.gated, entry.reason, not entry.gated)
@@ -48,6 +52,7 @@ class Core(Finder):
             lag = self.setup.options.lag
             text = f"too old: {age:.1f} s before the newest record, the lag is {lag:g} s"
             return self._refused(entry, "too old", text)
+        self._note_silence(entry)
         self.clock.tick(entry)
         outcome = self._take(entry)
         for due in self.clock.due():
@@ -66,16 +71,37 @@ class Core(Finder):
         )
         self.noted(note, math.inf)
 
+    def _note_silence(self, entry: Entry) -> None:
+        """Say so where time went on with nothing heard: perhaps it was the clock alone."""
+        now = self.clock.now
+        if now is None:
+            return
+        ahead = entry.t - now
+        intervals = [gate.interval for gate in self.gates.values() if gate.last is not None]
+        usual = min((i for i in intervals if i is not None), default=math.inf)
+        if ahead > max(SILENCE, SILENCE_INTERVALS * usual):
+            note = f"nothing was heard for {ahead:.3g} s, or the clock was set ahead"
+            self.noted(note, entry.t + self.setup.options.lag / 4.0)
+
     def _refused(self, entry: Entry, kind: str, reason: str) -> Outcome:
         self.gates[entry.kind].rejected[kind] += 1
-        return Outcome(False, reason)
+        entry.reason = kind
+        # Should the clock prove to have been set back, it will count after all.
+        return Outcome(False, reason, final=entry not in self.clock.behind)
 
     def _held_back(self, entry: Entry) -> Outcome:
         """A record from far ahead: kept until its time comes, or until others confirm it."""
         now = self.clock.now
         assert now is not None
         ahead = entry.t - now
+        if any(e.key == entry.key for e in self.clock.held):
+            text = f"duplicate: there is a record of {entry.t:g} s that waits for its time"
+            return self._refused(entry, "duplicate", text)
         run = self.clock.hold(entry)
+        for old in self.clock.overflow():
+            self.gates[old.kind].rejected["ahead"] += 1
+            text = f"held back: its time did not come, and {MOST_HELD} more wait for theirs"
+            self.events.append(Event("rejected", text, old.record, True))
         if not run:
             text = f"held back: {ahead:g} s ahead of the newest record; it waits for its time"
             return Outcome(False, text, final=False)
@@ -100,34 +126,44 @@ class Core(Finder):
 
     def _is_behind(self, entry: Entry) -> bool:
         """Whether a record proves that the clock was set back; then it has been taken."""
-        clock, tracker = self.clock, self.tracker
-        if clock.now is None or clock.now - entry.begin < LATE:
-            clock.behind.clear()
-            return False
+        clock = self.clock
         gate = self.gates[entry.kind]
-        twin = tracker.buffer.twin(entry)
-        before, after = tracker.buffer.neighbours(entry)
-        own = [e.t for e in clock.behind]
-        near = [e.t for e in (before, after) if e is not None and e.t not in own]
-        strange = (
-            (twin is not None and twin.values != entry.values and clock.now - entry.t > LATE)
-            or clock.age(entry) > self.setup.options.lag
-            or clock.overlaps(entry, near, gate.interval)
-        )
-        run = clock.suspect(entry, strange)
+        too_old = clock.age(entry) > self.setup.options.lag
+        strange = too_old or clock.is_strange(entry, gate.interval)
+        run = clock.suspect(entry, strange, self._rate() if strange else 0.0)
+        clock.note(entry)
         if not run:
             return False
         self._set_back(run)
         return True
 
+    def _rate(self) -> float:
+        """Records of all sensors that usually come, 1/s."""
+        now = self.clock.now
+        assert now is not None
+        rate = 0.0
+        for gate in self.gates.values():
+            if len(gate.times) > 2 and now - min(gate.times) > 0.0:
+                rate += (len(gate.times) - 1) / max(max(gate.times) - min(gate.times), 1e-3)
+        return rate
+
+    def _begin_clock(self, entry: Entry) -> None:
+        """See that outputs of another time do not stop those of the first record's."""
+        last = self.state.last_output
+        if self.clock.now is None and last is not None and last - entry.t > self.setup.options.lag:
+            self.state.last_output = None
+
     def _set_back(self, run: list[Entry]) -> None:
         """Move what is known back with the clock, and take the run of records behind it."""
         clock, tracker = self.clock, self.tracker
         assert clock.now is not None
-        known = list(tracker.buffer.all())
+        refused: list[Entry] = []
         for entry in run:
-            if any(entry is e for e in known):
+            if tracker.buffer.twin(entry) is entry:
                 tracker.buffer.remove(entry)
+            else:
+                self.gates[entry.kind].rejected[entry.reason] -= 1
+                refused.append(entry)
         first = min(e.begin for e in run)
         slots = math.ceil((clock.now - first) / tracker.spacing)
         by = -slots * tracker.spacing
@@ -136,10 +172,11 @@ class Core(Finder):
             gate.shift(by)
         step = clock.now - first
         self.state.shift(by)
-        clock.now += by
+        clock.shift(by)
         if step > self.setup.options.lag:
             # Outputs begin anew on the new clock: they would have to wait for ever.
             self.state.last_output = None
+        assert clock.now is not None
         self.noted(f"the clock was set back by {step:.3g} s", clock.now + self.setup.options.lag)
         if tracker.window is not None:
             tracker.window.touch_all()
@@ -149,7 +186,9 @@ class Core(Finder):
         for entry in sorted(run, key=lambda e: e.t):
             entry.gated, entry.reason = False, ""
             clock.tick(entry)
-            if tracker.buffer.twin(entry) is None:
+            if any(entry is e for e in refused):
+                self._take_event(entry)
+            else:
                 self._take(entry)
 
     def _take(self, entry: Entry) -> Outcome:
@@ -175,7 +214,8 @@ class Core(Finder):
             self.tracker.begin_at(entry.begin)
         now = self.clock.now
         assert now is not None
-        begin = min(entry.begin, now) - LEAP_SLACK
+        # The replies of other pings may have begun their flight as early as this one's.
+        begin = min(entry.begin, now) - LEAP_SLACK - (entry.t - entry.begin)
         if window is not None and begin - window.end > self.setup.options.lag:
             self.guarded(lambda: self.tracker.leap(begin))
 
@@ -201,17 +241,21 @@ class Core(Finder):
         if m is None or self.state.waiting:
             return 0.0, 1
         dt = entry.t - m.t
-        psd = max(self.setup.options.vertical_psd, DIVE_PSD)
-        variance = (
+        known = (
             m.covariance[2, 2]
             + 2.0 * dt * m.covariance[2, 5]
             + dt * dt * m.covariance[5, 5]
-            + psd * abs(dt) ** 3 / 3.0
             + entry.values[2] ** 2
         )
+        cube = abs(dt) ** 3 / 3.0
+        psd = self.setup.options.vertical_psd
+        variance = known + max(psd, DIVE_PSD) * cube
         arm = self.setup.vehicle.depth_sensor
         slack = 0.0 if arm.is_zero else float(np.linalg.norm(arm.body))
         away = max(abs(m.mean[2] + dt * m.mean[5] + entry.values[1]) - slack, 0.0)
+        if self.setup.options.motion == "constant_velocity":
+            # What a dive would excuse once the motion prior does not expect again and again.
+            self.gates["depth"].surprises.append(away * away / max(known + psd * cube, 1e-12))
         return away / math.sqrt(max(variance, 1e-12)), 1
 
     def _reopen_motion(self, gate: Gate) -> None:
@@ -270,6 +314,13 @@ class Core(Finder):
             self.state.waiting = "the position was lost; looking for it anew"
             self.state.lost_at = entry.begin
             self.find(entry.t)
+            return
+        if away > limit(dof) and entry.kind == "set_position":
+            # Who sets a position knows better than the track.
+            gate.accept(entry)
+            if self.guarded(lambda: self.tracker.jump_to([entry], anyway=True)):
+                self.after_rebuild("the position was set")
+                self.regated()
             return
         if away > limit(dof):
             self.tracker.regate(entry, True, f"gated: {away:.1f} sigma from what is expected")

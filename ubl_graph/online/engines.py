@@ -17,12 +17,14 @@ from ubl_graph.options import OnlineEngine
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """What is solved: first node, pings that count, their rows in one block per kind, equations."""
+    """What is solved: first node, version of the window, pings, rows by kind, equations, start."""
 
     first: int
+    version: int
     pings: Sequence[Entry]
     ranges: Sequence[RangeBlock]
     equations: WindowEquations
+    start: Point | None = None
 
 
 class Engine(Protocol):
@@ -52,7 +54,7 @@ class LmEngine:
         most: int,
     ) -> Point:
         """Minimise the equations' cost."""
-        return minimise(context.equations, x, most)
+        return minimise(context.equations, x, most, context.start)
 
     def note(self, changed: set[int]) -> None:
         """Nothing is kept from window to window."""

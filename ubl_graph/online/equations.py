@@ -206,6 +206,11 @@ class WindowEquations:
         """Columns of all nodes."""
         return self.nodes * self._width
 
+    @property
+    def size(self) -> int:
+        """Columns in all."""
+        return self.inner + self._border
+
     def evaluate(self, x: FloatArray, jacobian: bool = True) -> Point:
         """Evaluate all rows at `x`; without `jacobian` the range rows' Jacobians are empty."""
         nodes, shared = self._parts(x)
@@ -227,6 +232,16 @@ class WindowEquations:
             cost += self._loss.cost(r).sum()
             curved.append((r[:, 0], np.empty((0, 0)) if slope is None else slope[:, 0]))
         return Point(x, float(cost), linear, prior, curved)
+
+    def whitened_anew(self, point: Point, block: int, row: int, by: float) -> Point:
+        """A point with one range row's standard deviation divided by a factor."""
+        curved = [(r.copy(), slope.copy()) for r, slope in point.curved]
+        r, slope = curved[block]
+        before = float(self._loss.cost(r[row : row + 1])[0])
+        r[row] *= by
+        slope[row] *= by
+        cost = point.cost - before + float(self._loss.cost(r[row : row + 1])[0])
+        return Point(point.x, cost, point.linear, point.prior, curved)
 
     def gradient(self, point: Point) -> FloatArray:
         """Derivative of the cost, shape (n,)."""

@@ -119,10 +119,13 @@ class FixedLagEstimator:
         self._check(record)
         self.core.events = []
         outcome = Outcome(True)
-        for i in range(len(record)):
-            one = self.core.admit(entry_of(record if len(record) == 1 else record[i]))
+        rows = [record] if len(record) == 1 else [record[i] for i in range(len(record))]
+        for row in rows:
+            one = self.core.admit(entry_of(row))
             outcome = one if not one.accepted or outcome.accepted else outcome
-        return Outcome(outcome.accepted, outcome.reason, outcome.final, tuple(self.core.events))
+        # What became of the record itself the outcome says.
+        others = tuple(e for e in self.core.events if not any(e.record is r for r in rows))
+        return replace(outcome, others=others)
 
     def set_position(
         self, t: float, east: float, north: float, up: float | None = None, sigma: float = 10.0
@@ -226,7 +229,11 @@ class FixedLagEstimator:
         """Status, counts by sensor and reason, window and timing, ready for JSON."""
         now, state = self.core.clock.now, self.core.state
         window = self.core.tracker.window
-        moment = self.core.guarded(lambda: self.core.moment(now)) if state.located and now else None
+        moment = (
+            self.core.guarded(lambda: self.core.moment(now))
+            if state.located and now is not None
+            else None
+        )
         covariance = None if moment is None or not sound(moment) else self.core.widened(moment)
         t = 0.0 if now is None else now
         status, reasons = judge(self.core.facts(t, moment), self.core.gates, covariance)
@@ -296,7 +303,7 @@ class FixedLagEstimator:
             t = now
         if not math.isfinite(t) or abs(t) > MAX_TIME:
             raise TimeError(f"{t} is no time in seconds")
-        if now is not None and t > max(now, last or now) + FARTHEST:
+        if now is not None and t > now + FARTHEST:
             raise TimeError(
                 f"{t:g} s is {t - now:g} s ahead of the newest record; "
                 f"nothing is predicted farther than {FARTHEST:g} s ahead"

@@ -8,15 +8,18 @@ import numpy as np
 
 from ubl_graph.arrays import FloatArray
 from ubl_graph.mission import Start
-from ubl_graph.online.buffer import ABSOLUTE
+from ubl_graph.online.buffer import ABSOLUTE, PINGS, Entry
 from ubl_graph.online.gate import REOPENS, Gate, distance, limit
 from ubl_graph.online.keeper import Keeper
+from ubl_graph.online.outputs import Event
 from ubl_graph.online.search import Found
 
 #: A track found first is put to the test so long after, s, and when the window is full.
 CONFIRMED_AFTER = (5.0, 10.0, 20.0, 40.0)
 #: Tracks nearer to each other than this are one, m.
 APART = 20.0
+#: Fixes that leave the position open by more than this say nothing, m.
+FREE_SIGMA = 1e4
 #: Pings that a lost position is looked for with; a fix counts as three.
 ENOUGH = 6
 
@@ -34,6 +37,8 @@ class Finder(Keeper):
             # What was known misleads where it no longer holds: a few pings are no match for it.
             return
         state.searched_at = now
+        if not state.located and self._located_by_fixes(now):
+            return
         found = tracker.search(self._prior(now))
         if not found.usable:
             if not state.located:
@@ -43,14 +48,28 @@ class Finder(Keeper):
         adopted = self.guarded(lambda: tracker.adopt(found, anew=True))
         if not adopted:
             return
-        state.located, state.waiting = True, ""
+        self._begin_track(now)
         self._doubt(found)
         self.regated()
         if again:
             self.after_rebuild("the position was found anew")
-        state.located_at = now
+
+    def _begin_track(self, now: float) -> None:
+        state = self.state
+        self.tracker.located = state.located = True
+        state.waiting, state.located_at = "", now
         state.confirm = [now + s for s in CONFIRMED_AFTER if s < self.setup.options.lag]
         state.confirm.append(now + self.setup.options.lag)
+
+    def _located_by_fixes(self, now: float) -> bool:
+        """Begin without pings: fixes are linear, there is nothing to be looked for."""
+        if any(self.tracker.buffer.of(kind) for kind in PINGS):
+            return False
+        moment = self.guarded(lambda: self.tracker.solved_at(now))
+        if moment is None or not moment.covariance[:2, :2].diagonal().max() < FREE_SIGMA**2:
+            return False
+        self._begin_track(now)
+        return True
 
     def _prior(self, now: float) -> Start | None:
         """What is known of the position where it was lost."""
@@ -92,9 +111,20 @@ class Finder(Keeper):
         self._doubt(found)
 
     def _doubt(self, found: Found) -> None:
-        """Take note of whether a found track is the only one."""
-        self.state.ambiguous = found.reason if found.ambiguous else ""
-        self.state.rival = found.rival if found.ambiguous else None
+        """Take note of whether a found track is the only one.
+
+        The search looks at the last lag alone. Where a fix or a start has told on which side the
+        vehicle is, another track counts only if the window's past does not speak against it.
+        Without one the past knows no better: it was linearised about the track that is in doubt.
+        """
+        doubtful = found.ambiguous
+        anchors = sum(self.gates[kind].accepted for kind in ("position", "set_position"))
+        if doubtful and anchors and found.rival is not None:
+            doubtful = not self.guarded(lambda: self.tracker.excludes(found))
+        elif doubtful and anchors:
+            doubtful = bool(self.state.ambiguous)
+        self.state.ambiguous = found.reason if doubtful else ""
+        self.state.rival = found.rival if doubtful else None
 
     def _apart(self, found: Found) -> FloatArray | None:
         """How far a found track ends from the present one, m; None where its sigmas cover that."""
@@ -116,11 +146,25 @@ class Finder(Keeper):
         state.doubted_at = now
         here = [e for e in list(gate.refused)[-2 * REOPENS :] if self.tracker.holds(e)]
         here = [e for e in here if e.gated]
-        if len(here) < REOPENS - 1 or not self.guarded(lambda: self.tracker.break_at(here)):
+        if len(here) < REOPENS - 1:
             return
-        self.after_rebuild("the pings contradicted the track")
+        pings = here[0].kind in PINGS
+        jump = self.tracker.break_at if pings else self.tracker.jump_to
+        if not self.guarded(lambda: jump(here)):
+            return
+        told = "pings" if pings else "fixes"
+        self.after_rebuild(f"the {told} contradicted the track")
+        if not pings:
+            self.readmitted(here, "the track was begun anew and agrees")
         self.regated()
         gate.recent.clear()
+
+    def readmitted(self, entries: list[Entry], reason: str) -> None:
+        """Tell of records that count again."""
+        for entry in entries:
+            if not entry.gated:
+                self.gates[entry.kind].change_mind(entry)
+                self.events.append(Event("readmitted", reason, entry.record, False))
 
     @property
     def pause(self) -> float:

@@ -13,7 +13,7 @@ import math
 from collections import Counter, deque
 from dataclasses import dataclass, field
 from itertools import pairwise
-from statistics import fmean, median
+from statistics import fmean
 
 import numpy as np
 from scipy.special import chdtri
@@ -106,10 +106,14 @@ class Gate:
 
     @property
     def interval(self) -> float | None:
-        """Median time between accepted records, s; None where too few have come."""
+        """Time between accepted records that nine in ten keep, s; None where too few have come.
+
+        Pings may come in bursts; what counts is when the next one is due.
+        """
         if len(self.times) < 3:
             return None
-        return median(b - a for a, b in pairwise(sorted(self.times)))
+        gaps = sorted(b - a for a, b in pairwise(sorted(self.times)))
+        return gaps[int(0.9 * (len(gaps) - 1))]
 
     @property
     def surprise(self) -> float:
@@ -123,8 +127,9 @@ class Gate:
 
     @property
     def is_uneasy(self) -> bool:
-        """Whether half of the last few records were refused."""
-        return sum(list(self.recent)[-FEW:]) * 2 >= FEW
+        """Whether the last record was refused, or half of the last few."""
+        last = list(self.recent)[-FEW:]
+        return bool(last) and (last[-1] or sum(last) * 2 >= FEW)
 
     @property
     def refused_share(self) -> float:

@@ -133,12 +133,12 @@ def judge(
         return "lost", tuple(filter(None, (facts.waiting, *given)))
     if facts.rebuilt:
         return "rebuilt", ("begun anew from the records of the last lag", *given)
-    if facts.t < facts.warm_until:
-        wait = facts.warm_until - facts.t
-        return "degraded", (f"{wait:.0f} s until the window is full", *given)
     absolute = [kind for kind in ABSOLUTE if gates[kind].last is not None]
     if all(kind in silent for kind in absolute):
         return "coasting", given
+    if facts.t < facts.warm_until:
+        wait = facts.warm_until - facts.t
+        return "degraded", (f"{wait:.0f} s until the window is full", *given)
     return ("degraded", given) if given else ("ok", ())
 
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from ubl_graph.arrays import FloatArray
-from ubl_graph.errors import UblGraphError
 from ubl_graph.mission import Setup, Start
 from ubl_graph.online.buffer import ABSOLUTE, KINDS
 from ubl_graph.online.clock import Clock
@@ -20,7 +19,7 @@ from ubl_graph.online.state import Moment
 from ubl_graph.online.tracker import METRES, Tracker
 
 #: What can go wrong in a solve.
-_FAILURES = (UblGraphError, RuntimeError, ArithmeticError, ValueError, IndexError)
+_FAILURES = (Exception,)
 
 
 class Keeper:
@@ -67,6 +66,8 @@ class Keeper:
         """Decide on the records that leave the window, and let it move on."""
         now = self.clock.now
         assert now is not None
+        if self.tracker.window is None:
+            self.tracker.trim(now)
         if not self.tracker.is_due(now):
             return
         if self.state.located and not self.state.waiting:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -19,6 +20,12 @@ from ubl_graph.online.rows import Break, Frame
 from ubl_graph.online.window import RowsOf, Window, frame_of
 from ubl_graph.solve.banded import BandedFactor
 
+#: Acoustic metres per second, for words and widths.
+METRES = 1500.0
+#: Nodes are kept longer than the lag while pings bend too much, but so many at the most.
+MOST_NODES = 1200
+#: What the curvature of range circles may shift a window's pings by, in their sigmas together.
+MOST_BENT = 0.03
 #: The window keeps so many seconds more than the lag: neighbours of the oldest records.
 MARGIN = 2.0
 
@@ -69,6 +76,8 @@ class Ledger:
         # Velocities that have come, and how many had when their pace was looked at last.
         self._velocities = self._paced = 0
         self._spread = 1.0
+        # Counts what may change a window's pings, nodes or rows.
+        self.version = 0
         self._judging: Context | None = None
         self.horizontal_sigma = 0.0
         self.turned: list[Entry] = []
@@ -109,6 +118,7 @@ class Ledger:
 
     def insert(self, entry: Entry) -> None:
         """Take a record into the buffer and mark what it changes."""
+        self.version += 1
         self.buffer.add(entry)
         self._velocities += entry.kind == "velocity"
         self._learn(entry)
@@ -121,6 +131,7 @@ class Ledger:
 
     def regate(self, entry: Entry, gated: bool, reason: str = "") -> None:
         """Turn an entry's fate."""
+        self.version += 1
         entry.gated, entry.reason = gated, reason
         self._touch(entry)
 
@@ -169,6 +180,7 @@ class Ledger:
 
     def _forget(self) -> None:
         """What was solved holds no longer."""
+        self.version += 1
         self._solved = self._factor = self._judging = None
         self._engine.forget()
 
@@ -199,15 +211,16 @@ class Ledger:
     def extend(self, t: float) -> None:
         """Make nodes up to `t`, s."""
         if self.window is not None:
+            count = self.window.count
             self.window.extend(t)
+            self.version += self.window.count > count
 
     def holds(self, entry: Entry) -> bool:
-        """Whether a ping lies within the window."""
+        """Whether a record lies within the window."""
         window = self.window
         return (
             window is not None
             and self.buffer.twin(entry) is entry
-            and entry.kind in PINGS
             and entry.begin >= window.begin - 1e-9
         )
 
@@ -240,8 +253,41 @@ class Ledger:
         if not self.is_due(t):
             return
         while self._first_kept(t) > window.first and window.count > 2:
+            if window.count < MOST_NODES and self.bends(window.begin + self.spacing - 1e-9):
+                break
             self._drop_first()
         self.buffer.trim(window.begin - MARGIN)
+
+    def bends(self, before: float) -> bool:
+        """Whether pings that begin before a time (s) are too curved to be linearised for good.
+
+        Where the vehicle may be off by s across a range R, a linearised range is off by s^2 / 2R,
+        the same way for all pings of the window. Rows of the past that were linearised at places
+        that turned out wrong would claim to know the bearing.
+        """
+        window = self.window
+        if window is None or not self.located:
+            return False
+        leaving = [e for e in window.usable() if e.begin < before]
+        if not leaving:
+            return False
+        count = len(window.usable())
+        limit = min(MOST_BENT * _straightness(e) / math.sqrt(count) for e in leaving)
+        return self.horizontal_sigma**2 > limit and self.first_variance() > limit
+
+    def first_variance(self) -> float:
+        """Horizontal variance of the first node where the window was solved last, m^2."""
+        solved = self._solved
+        if solved is None:
+            return self.horizontal_sigma**2
+        if self._factor is None:
+            self._factor = solved.equations.factor(solved.point)
+        size = solved.equations.size
+        at = (self.window.first - solved.first) * self.window.frame.width if self.window else 0
+        unit = np.zeros((2, size))
+        unit[0, at] = unit[1, at + 1] = 1.0
+        columns = np.stack([self._factor.solve(u) for u in unit])
+        return float(np.linalg.eigvalsh(columns[:, at : at + 2])[-1])
 
     def _first_kept(self, t: float) -> int:
         return slot_of(t - self.lag - MARGIN, self.spacing)
@@ -251,6 +297,7 @@ class Ledger:
         assert window is not None
         if window.is_first_dirty:
             self._engine.note(window.refresh())
+        self.version += 1
         window.drop(self._rows_leaving(window.begin + self.spacing - 1e-9))
 
     def _rows_leaving(self, before: float) -> list[RowsOf]:
@@ -298,6 +345,14 @@ class Ledger:
         if self.window is not None:
             self.window.shift(slots)
         self._forget()
+
+
+def _straightness(entry: Entry) -> float:
+    """Twice the range times its standard deviation, m^2."""
+    legs = 2.0 if entry.kind == "two_way_range" else 1.0
+    flight = abs(entry.values[3]) if legs == 2.0 else abs(entry.values[2] - entry.values[1])
+    reach = max(METRES * flight / legs, 10.0)
+    return 2.0 * reach * METRES * entry.values[-1] / legs
 
 
 def _raw(block: RangeBlock, x: FloatArray, held: FloatArray) -> tuple[FloatArray, FloatArray]:

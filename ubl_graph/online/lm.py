@@ -25,7 +25,9 @@ WORTHWHILE = 0.1
 DAMPINGS = (1e-4, 1e-2, 1.0, 1e2, 1e4, 1e6)
 
 
-def minimise(equations: WindowEquations, x: FloatArray, most: int) -> Point:
+def minimise(
+    equations: WindowEquations, x: FloatArray, most: int, start: Point | None = None
+) -> Point:
     """Where the cost is least, searched from `x`.
 
     Parameters
@@ -37,6 +39,8 @@ def minimise(equations: WindowEquations, x: FloatArray, most: int) -> Point:
     most : int
         Steps at the most. Where they do not suffice the last point is good enough: the next solve
         goes on from there.
+    start : Point, optional
+        The equations evaluated at `x`, where that has been done.
 
     Returns
     -------
@@ -49,11 +53,10 @@ def minimise(equations: WindowEquations, x: FloatArray, most: int) -> Point:
     """
     # A trial step may go far astray; what overflows there is refused by its cost.
     with np.errstate(over="ignore", invalid="ignore"):
-        return _descended(equations, x, most)
+        return _descended(equations, equations.evaluate(x) if start is None else start, most)
 
 
-def _descended(equations: WindowEquations, x: FloatArray, most: int) -> Point:
-    point = equations.evaluate(x)
+def _descended(equations: WindowEquations, point: Point, most: int) -> Point:
     for _ in range(most):
         if not np.isfinite(point.cost):
             raise SolverError("the window's cost is not finite")

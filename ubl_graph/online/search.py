@@ -44,6 +44,20 @@ class Found:
         return self.result is not None and (self.ambiguous or not self.reason)
 
     @property
+    def other(self) -> Found:
+        """The same with the other track in place of the best one."""
+        assert self.result is not None
+        segment = self.result.segments[0]
+        track = segment.trajectory
+        assert segment.rival is not None
+        velocity = track.velocity
+        if len(track.t) > 1:
+            velocity = np.gradient(segment.rival, track.t, axis=0)
+        mirrored = replace(track, position=segment.rival, velocity=velocity)
+        segments = (replace(segment, trajectory=mirrored), *self.result.segments[1:])
+        return replace(self, result=replace(self.result, segments=segments))
+
+    @property
     def rival(self) -> FloatArray | None:
         """How far away the other track ends, east, north, up, m; None where it is not one place."""
         if self.result is None:

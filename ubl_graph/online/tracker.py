@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from ubl_graph.online.buffer import PINGS, Entry
 from ubl_graph.online.engines import Context
 from ubl_graph.online.equations import Point
 from ubl_graph.online.gate import distance, limit
-from ubl_graph.online.ledger import Ledger, Solved
+from ubl_graph.online.ledger import MARGIN, METRES, Ledger, Solved
 from ubl_graph.online.lm import minimise
 from ubl_graph.online.rows import Break, attitude_over
 from ubl_graph.online.search import Found, placed, search
@@ -40,14 +41,14 @@ MUTED = 1e9
 LOOK_AT_PACE = 20
 #: A track found anew replaces the present one where its cost is lower by more than this.
 BETTER_COST = 3.0
+#: Tracks that end nearer to each other than this are one, m.
+SAME_PLACE = 20.0
 #: So many of the pings since a jump must agree with the track behind it, as a share.
 AGREEING = 0.6
 #: What a jump must save, in cost: its own price, and odds of thousands to one.
 BREAK_COST = 12.0
 #: Nearest to which the vehicle may have stepped at a break, m, in multiples of what was refused.
 LEAST_STEP, STEP_FACTOR = 10.0, 3.0
-#: Acoustic metres per second, for words and widths.
-METRES = 1500.0
 
 
 class Tracker(Ledger):
@@ -67,9 +68,9 @@ class Tracker(Ledger):
             return self._judge_fix(entry)
         window = self._refreshed()
         self._spread = 1.0
-        if not self._answers(window, entry):
-            return 0.0, 1
         context = self._context(window)
+        if not any(e is entry for e in context.pings):
+            return 0.0, 1
         block, row = _place_of(entry, context.pings, context.ranges)
         frozen = context.equations.frozen
         muted = [held.copy() for held in frozen]
@@ -78,22 +79,27 @@ class Tracker(Ledger):
         x = window.vector
         point = context.equations.evaluate(x)
         factor = context.equations.factor(point)
+        context.equations.frozen = frozen
         if window.is_touched:
             # Only linear rows have changed: one step is all but exact, and the solve goes on.
             x = x + factor.solve(-context.equations.gradient(point))
             window.put(x)
-        context.equations.frozen = frozen
-        self._judging = context
-        r, slope = context.ranges[block].evaluate(x, frozen[block], slice(row, row + 1))
-        assert slope is not None
-        line = np.zeros(len(x) + 1)
+            # What was solved last stands elsewhere now; nothing may be linearised by it.
+            self._solved = self._factor = None
+            point = context.equations.evaluate(x)
+        else:
+            point = context.equations.whitened_anew(point, block, row, MUTED)
+        self._judging = replace(context, start=point)
+        r, slope = (part[row] for part in point.curved[block])
         columns = context.ranges[block].columns[row]
-        np.add.at(line, np.where(columns < 0, len(x), columns), slope[0, 0])
+        places = np.where(columns < 0, len(x), columns)
+        line: FloatArray = np.zeros(len(x) + 1)
+        np.add.at(line, places, slope)
         line = line[:-1]
         self._spread = 1.0 + float(np.einsum("i,i->", line, factor.solve(line)))
         last = tail_covariance(factor, window.frame.width, window.count * window.frame.width)
         self.horizontal_sigma = float(np.sqrt(np.linalg.eigvalsh(last[:2, :2])[-1]))
-        return abs(float(r[0, 0])) / np.sqrt(self._spread), 1
+        return abs(float(r)) / np.sqrt(self._spread), 1
 
     def _context(self, window: Window) -> Context:
         """Rows and equations of all pings that count."""
@@ -102,19 +108,21 @@ class Tracker(Ledger):
         equations = window.equations(ranges)
         x = window.vector
         equations.frozen = [b.frozen(x) for b in ranges]
-        return Context(window.first, pings, ranges, equations)
-
-    @staticmethod
-    def _answers(window: Window, entry: Entry) -> bool:
-        """Whether a ping can be used as things stand."""
-        return any(e is entry for e in window.usable())
+        return Context(window.first, self.version, pings, ranges, equations)
 
     def _judge_fix(self, entry: Entry) -> tuple[float, int]:
+        """The same for a fix: its gap to the track is linear in the unknowns."""
         self._spread = 1.0
         self.regate(entry, True)
         self.solve()
-        moment = self.moment(entry.t)
+        gap, covariance = self._fix_gap(entry)
         self.regate(entry, False)
+        return distance(gap, covariance), len(gap)
+
+    def _fix_gap(self, entry: Entry) -> tuple[FloatArray, FloatArray]:
+        """From the track as it was solved last to a fix: gap (d,), m, and its covariance."""
+        moment = self.moment(entry.t)
+        self.horizontal_sigma = float(np.sqrt(np.linalg.eigvalsh(moment.covariance[:2, :2])[-1]))
         lever = np.zeros(3)
         if isinstance(entry.record, Start):
             start = entry.record
@@ -124,13 +132,13 @@ class Tracker(Ledger):
             place, covariance = entry.values[1][0], entry.values[2][0]
             track = attitude_over(self.buffer, entry.t, entry.t)
             arm = self.setup.vehicle.antenna
-            if track is None and not arm.is_zero:
-                return 0.0, len(place)
             if track is not None:
                 lever = track.lever(arm, np.array([entry.t]))[0]
+            elif not arm.is_zero:
+                # Without attitude it does not count, and there is nothing to be judged.
+                return np.zeros(len(place)), covariance
         d = len(place)
-        gap = place - (moment.mean[:3] + lever)[:d]
-        return distance(gap, covariance + moment.covariance[:d, :d]), d
+        return place - (moment.mean[:3] + lever)[:d], covariance + moment.covariance[:d, :d]
 
     @property
     def is_wide(self) -> bool:
@@ -141,12 +149,9 @@ class Tracker(Ledger):
         """Solve the window from where it is; `afar`: from the convex side of the loss."""
         window = self._refreshed()
         judged, self._judging = self._judging, None
-        fits = (
-            judged is not None
-            and (judged.first, judged.equations.nodes) == (window.first, window.count)
-            and judged.pings == window.usable()
-        )
-        context = judged if judged is not None and fits else self._context(window)
+        if judged is None or judged.version != self.version:
+            judged = self._context(window)
+        context = judged
         equations, x = context.equations, window.vector
         if afar and context.ranges:
             frozen = equations.frozen
@@ -154,6 +159,7 @@ class Tracker(Ledger):
                 equations.frozen = [width * held for held in frozen]
                 x = minimise(equations, x, STEPS_AFAR).x
             equations.frozen = [b.frozen(x) for b in context.ranges]
+            context = replace(context, start=None)
         point = self._engine.solve(window, context, x, STEPS_AFAR if afar else STEPS)
         window.put(point.x)
         self._keep(context, point)
@@ -259,13 +265,14 @@ class Tracker(Ledger):
             for block in window.ranges(usable):
                 kind = [e for e in usable if e.kind == block.name]
                 r, _ = block.evaluate(x, block.frozen(x), jacobian=False)
-                out += list(zip(kind, (float(v) for v in r[:, 0]), strict=True))
+                out += [(e, float(v)) for e, v in zip(kind, r[:, 0], strict=True)]
         return out
 
     @contextmanager
     def _opened(self) -> Generator[None]:
         """Count gated pings in for a while."""
         gated = [e for kind in PINGS for e in self.buffer.of(kind) if e.gated]
+        self.version += bool(gated)
         for entry in gated:
             entry.gated = False
         try:
@@ -304,7 +311,7 @@ class Tracker(Ledger):
         up = (window.vector[at.columns[:, :, 2]] * at.weights).sum(axis=1)
         lever = np.zeros(len(times)) if track is None else track.lever(arm, times)[:, 2]
         return [
-            (e, (u + a + e.values[1]) / e.values[2])
+            (e, float(u + a + e.values[1]) / e.values[2])
             for e, u, a in zip(some, up, lever, strict=True)
         ]
 
@@ -322,8 +329,15 @@ class Tracker(Ledger):
 
     def search(self, start: Start | None = None) -> Found:
         """Look for the position in all that the buffer holds."""
-        assert self.window is not None
-        return search(self.setup, self.buffer, self.spacing, self.window.begin, start)
+        window = self.window
+        assert window is not None
+        begin = max(window.begin, window.end - self.spacing - self.lag - MARGIN)
+        return search(self.setup, self.buffer, self.spacing, begin, start)
+
+    def solved_at(self, t: float) -> Moment:
+        """Solve the window and say where that leaves the vehicle at `t`, s."""
+        self.solve()
+        return self.moment(t)
 
     def adopt(self, found: Found, anew: bool = False) -> bool:
         """Go on from a found track where that fits better than the present one; whether it did.
@@ -340,6 +354,15 @@ class Tracker(Ledger):
         self._judged(self.residuals())
         self.solve()
         return True
+
+    def excludes(self, found: Found) -> bool:
+        """Whether the window's cost speaks against the other track that a search found."""
+        window = self._refreshed()
+        present, here = self.cost_from(window.vector)
+        cost, there = self.cost_from(placed(window, found.other))
+        end = slice((window.count - 1) * window.frame.width, None)
+        gap = float(np.hypot(*(there[end] - here[end])[:2]))
+        return cost > present + BETTER_COST or gap < SAME_PLACE
 
     def _judged(self, residuals: Sequence[tuple[Entry, float]]) -> bool:
         """Gate records by their residuals where the window stands; whether a fate turned."""
@@ -380,6 +403,36 @@ class Tracker(Ledger):
             self._judged(self.residuals())
             self.solve()
             return True
+        window.put(saved)
+        window.breaks = breaks
+        window.touch(slot * self.spacing, slot * self.spacing)
+        self._forget()
+        return False
+
+    def jump_to(self, marks: Sequence[Entry], anyway: bool = False) -> bool:
+        """Let the vehicle have jumped to where refused fixes say; whether they agree on it.
+
+        `anyway`: someone said so, and whether the pings since agree does not matter.
+        """
+        window = self._refreshed()
+        saved, breaks = window.vector, dict(window.breaks)
+        begin = max(min(e.t for e in marks), window.begin)
+        slot = max(slot_of(begin, self.spacing) - 1, window.first)
+        sizes = [float(np.linalg.norm(self._fix_gap(e)[0])) for e in marks]
+        window.breaks[slot] = Break(max(LEAST_STEP, STEP_FACTOR * max(sizes)))
+        window.touch(slot * self.spacing, slot * self.spacing)
+        for entry in marks:
+            self.regate(entry, False)
+        self.solve(afar=True)
+        agree = [distance(*g) <= limit(len(g[0])) for g in map(self._fix_gap, marks)]
+        since = [abs(r) < limit(1) for e, r in self.residuals() if e.begin >= begin]
+        if anyway or (np.mean(agree) >= AGREEING and np.mean(since or [1.0]) >= AGREEING):
+            self.rebuilds += 1
+            self._judged(self.residuals())
+            self.solve()
+            return True
+        for entry in marks:
+            self.regate(entry, True, entry.reason)
         window.put(saved)
         window.breaks = breaks
         window.touch(slot * self.spacing, slot * self.spacing)
@@ -430,7 +483,8 @@ class Tracker(Ledger):
         if not leaving:
             return
         pings = [e for e in leaving if e.kind in PINGS]
-        turned = self._judged([*self._residuals_kept(pings), *self._depth_residuals(leaving)])
+        depths = self._depth_residuals(leaving)
+        turned = self._judged([*self._residuals_kept(pings), *depths])
         if turned:
             self.solve()
 
