@@ -31,7 +31,7 @@ NODES = 5000
 SMALL = 60
 #: A window, and a contest in it.
 WINDOW = 20
-CONTEST = online.Contest(dict.fromkeys((*online.LISTED, online.SETTLED), 8), rest=4)
+CONTEST = online.Contest(dict.fromkeys((*online.LISTED, online.ONE_UPDATE), 8), rest=4)
 TINY = script.Plan(
     races={SMALL: 1},
     reported={},
@@ -317,7 +317,7 @@ def test_the_contestants_agree(contest):
     assert all(pair.agrees for pair in pairs)
     apart = {pair.name: pair.difference for pair in pairs}
     assert apart["online_lm_vs_isam2"] < 1e-3
-    assert apart["online_vs_plain_settled"] < 5e-3
+    assert apart["online_vs_plain_custom"] < 5e-3
     end = online.circle(np.array([WINDOW + CONTEST.rest + 8.0]))[0]
     for name, one in timed.items():
         assert one.positions.shape == (8, 3)
@@ -331,7 +331,7 @@ def test_contestants_that_differ_fail_the_run(monkeypatch, capsys):
     failed = [line for line in capsys.readouterr().out.splitlines() if line.startswith("FAILED")]
     assert [line.split()[1] for line in failed] == [
         "online_vs_plain_custom,",
-        "online_vs_plain_settled,",
+        "online_vs_plain_one_update,",
     ]
 
 
@@ -349,7 +349,7 @@ def test_a_ping_a_node():
 
 def test_the_rival_is_bare_and_has_the_window_that_was_asked_for():
     stream = online.pings(WINDOW + 10)
-    plain = online.Plain(WINDOW)
+    plain = online.Plain(WINDOW, online.DEFAULT_THRESHOLD, settles=False)
     assert isinstance(plain.prepare(0, stream[0]), gtsam.CustomFactor)
     runner = online.Runner(plain, stream)
     with pytest.raises(RuntimeError, match="the window has 5 nodes, not 20"):

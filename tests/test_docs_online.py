@@ -49,7 +49,7 @@ def test_the_control_loop_goes_through_all_statuses_and_comes_back(lines, folder
     told = [re.fullmatch(r"(\S+) s (\w+): (\S+) m/s at (\d+) m", line) for line in lines]
     statuses = [m[2] for m in told if m]
     assert statuses == [
-        *("initialising", "degraded", "ok"),
+        *("degraded", "ok"),
         *("degraded", "coasting", "lost"),
         *("degraded", "ok"),
     ]

@@ -236,7 +236,7 @@ def test_a_gate_counts_and_doubts():
     for t in range(30):
         gate.accept(ping(float(t)), 4.0)
     assert (gate.accepted, gate.last, gate.interval) == (30, 29.0, 1.0)
-    assert gate.surprise == 4.0
+    assert gate.surprise == pytest.approx(4.0 / chi2.ppf(0.5, 1), rel=1e-3)
     assert not gate.is_doubtful and not gate.is_uneasy and gate.refused_share == 0.0
     bad = [ping(30.0 + t) for t in range(REOPENS)]
     for e in bad[:-1]:

@@ -8,7 +8,7 @@ from time import perf_counter
 
 import numpy as np
 
-from ubl_graph.online.buffer import ABSOLUTE, Entry, entry_of
+from ubl_graph.online.buffer import ABSOLUTE, PINGS, Entry, entry_of
 from ubl_graph.online.clock import MOST_HELD
 from ubl_graph.online.finder import Finder
 from ubl_graph.online.gate import REOPENS, Gate, limit, step_distance
@@ -127,6 +127,9 @@ class Core(Finder):
     def _is_behind(self, entry: Entry) -> bool:
         """Whether a record proves that the clock was set back; then it has been taken."""
         clock = self.clock
+        twin = self.tracker.buffer.twin(entry)
+        if twin is not None and twin.equals(entry):
+            return False  # sent once more, which says nothing of the clock
         gate = self.gates[entry.kind]
         too_old = clock.age(entry) > self.setup.options.lag
         strange = too_old or clock.is_strange(entry, gate.interval)
@@ -308,7 +311,7 @@ class Core(Finder):
             gate.accept(entry)
             return
         away, dof = judged
-        if self.is_lost():
+        if entry.kind in PINGS and self.is_lost():
             # So vague a track has many ways to meet the pings: look for all of them.
             gate.accept(entry)
             self.state.waiting = "the position was lost; looking for it anew"

@@ -13,7 +13,7 @@ import math
 from collections import Counter, deque
 from dataclasses import dataclass, field
 from itertools import pairwise
-from statistics import fmean
+from statistics import median
 
 import numpy as np
 from scipy.special import chdtri
@@ -26,6 +26,8 @@ from ubl_graph.online.buffer import Entry
 REFUSED_SHARE = 5.7e-7
 #: So many refusals in a row, or among twice as many records, put the estimate in doubt.
 REOPENS = 5
+#: Median of the square of a normal deviate.
+MEDIAN_SQUARE = 0.4549
 #: A few records.
 FEW = 6
 #: Judgements that are looked back on.
@@ -117,8 +119,13 @@ class Gate:
 
     @property
     def surprise(self) -> float:
-        """Mean of `surprises`, 1 where there are too few to tell."""
-        return fmean(self.surprises) if len(self.surprises) >= MEMORY // 2 else 1.0
+        """Median of `surprises` by that of a good sensor, 1 where there are too few to tell.
+
+        A manoeuvre surprises for a while; sigmas that are too small do for good.
+        """
+        if len(self.surprises) < MEMORY // 2:
+            return 1.0
+        return median(self.surprises) / MEDIAN_SQUARE
 
     @property
     def is_doubtful(self) -> bool:
@@ -127,9 +134,8 @@ class Gate:
 
     @property
     def is_uneasy(self) -> bool:
-        """Whether the last record was refused, or half of the last few."""
-        last = list(self.recent)[-FEW:]
-        return bool(last) and (last[-1] or sum(last) * 2 >= FEW)
+        """Whether half of the last few records were refused."""
+        return sum(list(self.recent)[-FEW:]) * 2 >= FEW
 
     @property
     def refused_share(self) -> float:

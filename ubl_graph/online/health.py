@@ -28,9 +28,9 @@ LOST_LEAST = 50.0
 LOST_REFUSED, LEAST_JUDGED = 0.8, 8
 #: Chi-square of a window's pings, per ping, that the sigmas explain.
 CHI_SQUARE = 4.0
-#: Mean squared distance of a sensor's records from what is expected, 1 by right: with twenty of
-#: them it passes this once in ten million.
-SURPRISE = 3.0
+#: Median squared distance of a sensor's records from what is expected, 1 by right: with twenty of
+#: them it passes this once in five hundred.
+SURPRISE = 3.5
 #: Latencies that are looked back on.
 MEMORY = 1000
 
@@ -173,7 +173,9 @@ def silences(t: float, gates: Mapping[str, Gate]) -> dict[str, str]:
 def _doubts(facts: Facts, gates: Mapping[str, Gate]) -> list[str]:
     doubts = [note for note, until in facts.notes.items() if facts.t < until]
     for kind, gate in gates.items():
-        if gate.is_uneasy:
+        if kind in ABSOLUTE and gate.recent and gate.recent[-1]:
+            doubts.append(f"{kind}: the last record was refused")
+        elif gate.is_uneasy:
             doubts.append(f"{kind}: {100 * gate.refused_share:.0f} % of the last records refused")
         if gate.surprise > SURPRISE:
             doubts.append(

@@ -20,7 +20,7 @@ LEAST_DECREMENT = 1e-13
 #: Costs that differ by less than this share of them are equal to rounding.
 SAME_COST = 1e-12
 #: A factor is used again while each of its steps gains less than this share of the last one's.
-WORTHWHILE = 0.1
+WORTHWHILE = 0.01
 #: Dampings tried, as shares of the diagonal, where the undamped steps fail.
 DAMPINGS = (1e-4, 1e-2, 1.0, 1e2, 1e4, 1e6)
 
