@@ -34,7 +34,8 @@ from ubl_graph.online.buffer import Buffer, entry_of
 from ubl_graph.online.clock import AHEAD, BEHIND, Clock
 from ubl_graph.online.equations import WindowEquations
 from ubl_graph.online.gate import REOPENS, Gate, distance, limit, step_distance
-from ubl_graph.online.window import RowsOf, Window, frame_of
+from ubl_graph.online.rows import frame_of
+from ubl_graph.online.window import RowsOf, Window
 from ubl_graph.trajectory import (
     interpolation_covariance,
     interpolation_variance,

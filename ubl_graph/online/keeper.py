@@ -14,9 +14,10 @@ from ubl_graph.online.buffer import ABSOLUTE, KINDS
 from ubl_graph.online.clock import Clock
 from ubl_graph.online.gate import Gate
 from ubl_graph.online.health import LOST_LEAST, LOST_SHARE, Facts, Latency
+from ubl_graph.online.ledger import METRES
 from ubl_graph.online.outputs import Event, Memory
+from ubl_graph.online.revision import Reviser
 from ubl_graph.online.state import Moment
-from ubl_graph.online.tracker import METRES, Tracker
 
 #: What can go wrong in a solve.
 _FAILURES = (Exception,)
@@ -32,7 +33,7 @@ class Keeper:
 
     Attributes
     ----------
-    tracker : Tracker
+    tracker : Reviser
         Buffer, window and engine.
     clock : Clock
         The newest time.
@@ -48,7 +49,7 @@ class Keeper:
 
     def __init__(self, setup: Setup) -> None:
         self.setup = setup
-        self.tracker = Tracker(setup)
+        self.tracker = Reviser(setup)
         self.clock = Clock(setup.options.lag)
         self.gates = {kind: Gate() for kind in KINDS}
         self.state = Memory()

@@ -16,8 +16,8 @@ from ubl_graph.nodes import grid, grid_spacing, slot_of
 from ubl_graph.online.buffer import PINGS, Buffer, Entry
 from ubl_graph.online.engines import Context, engine_of
 from ubl_graph.online.equations import Point, WindowEquations
-from ubl_graph.online.rows import Break, Frame
-from ubl_graph.online.window import RowsOf, Window, frame_of
+from ubl_graph.online.rows import Break, Frame, frame_of
+from ubl_graph.online.window import RowsOf, Window
 from ubl_graph.solve.banded import BandedFactor
 
 #: Acoustic metres per second, for words and widths.

@@ -7,7 +7,7 @@ makes a whole mission's problem. The range rows, which are not linear, are not h
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -17,10 +17,10 @@ from ubl_graph.arrays import FloatArray, IntArray
 from ubl_graph.attitude import AttitudeTrack
 from ubl_graph.factors.block import Block, LinearBlock
 from ubl_graph.factors.odometry import Preintegration
-from ubl_graph.graph import Builder, SegmentModel
+from ubl_graph.graph import Builder, SegmentModel, shared_states
 from ubl_graph.layout import KINEMATIC, Chain, Layout
 from ubl_graph.mission import Segment, Setup
-from ubl_graph.nodes import grid
+from ubl_graph.nodes import grid, order_of
 from ubl_graph.online.buffer import Buffer, columns_of, fixes_of
 from ubl_graph.trajectory import Order, transition
 
@@ -91,6 +91,38 @@ class Frame:
     def layout(self, times: FloatArray) -> Layout:
         """The layout of nodes at some times."""
         return Layout((Chain("", 0, times),), self.order, self.slow, self.shared)
+
+
+def frame_of(
+    setup: Setup, kinds: Iterable[str], lasting: float, gap: float, spacing: float
+) -> Frame:
+    """The unknowns that the kinds of records seen so far ask for.
+
+    Parameters
+    ----------
+    setup : Setup
+        Options and beacons.
+    kinds : iterable of str
+        Record kinds; "water" and "bottom" for velocities.
+    lasting : float
+        Standard deviation of the heading reference's lasting error, rad.
+    gap : float
+        Longest gap that velocities bridge, s.
+    spacing : float
+        Of the nodes, s.
+    """
+    seen = set(kinds)
+    options = setup.options
+    slow: list[tuple[str, int]] = []
+    if options.estimate_sound_speed and setup.beacons:
+        slow.append(("sound_speed", 1))
+    if "one_way_range" in seen:
+        slow += [("clock_offset", 1), ("clock_drift", 1)]
+    if "water" in seen:
+        slow.append(("current", 2))
+    odometry = bool({"water", "bottom"} & seen)
+    shared = shared_states(setup, lasting if odometry else None)
+    return Frame(setup, spacing, order_of(options), tuple(slow), shared, lasting, gap)
 
 
 def attitude_over(buffer: Buffer, begin: float, end: float) -> AttitudeTrack | None:

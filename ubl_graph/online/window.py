@@ -18,10 +18,9 @@ from ubl_graph.arrays import FloatArray, IntArray
 from ubl_graph.factors.block import Block, LinearBlock
 from ubl_graph.factors.loss import RobustLoss
 from ubl_graph.factors.ranges import RangeBlock
-from ubl_graph.graph import Builder, shared_states
+from ubl_graph.graph import Builder
 from ubl_graph.layout import KINEMATIC, Layout
-from ubl_graph.mission import Setup
-from ubl_graph.nodes import grid, order_of, slot_of
+from ubl_graph.nodes import grid, slot_of
 from ubl_graph.online.buffer import PINGS, Buffer, Entry, columns_of
 from ubl_graph.online.equations import LinearRows, WindowEquations
 from ubl_graph.online.rows import Break, Frame, attitude_over, interval_rows, triangle
@@ -456,35 +455,3 @@ def _runs(numbers: Iterable[int]) -> list[tuple[int, int]]:
         else:
             runs.append((k, 1))
     return runs
-
-
-def frame_of(
-    setup: Setup, kinds: Iterable[str], lasting: float, gap: float, spacing: float
-) -> Frame:
-    """The unknowns that the kinds of records seen so far ask for.
-
-    Parameters
-    ----------
-    setup : Setup
-        Options and beacons.
-    kinds : iterable of str
-        Record kinds; "water" and "bottom" for velocities.
-    lasting : float
-        Standard deviation of the heading reference's lasting error, rad.
-    gap : float
-        Longest gap that velocities bridge, s.
-    spacing : float
-        Of the nodes, s.
-    """
-    seen = set(kinds)
-    options = setup.options
-    slow: list[tuple[str, int]] = []
-    if options.estimate_sound_speed and setup.beacons:
-        slow.append(("sound_speed", 1))
-    if "one_way_range" in seen:
-        slow += [("clock_offset", 1), ("clock_drift", 1)]
-    if "water" in seen:
-        slow.append(("current", 2))
-    odometry = bool({"water", "bottom"} & seen)
-    shared = shared_states(setup, lasting if odometry else None)
-    return Frame(setup, spacing, order_of(options), tuple(slow), shared, lasting, gap)
