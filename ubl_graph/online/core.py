@@ -275,14 +275,9 @@ class Core(Finder):
             if spread > 5.0 * max(e.values[2] for e in run) + times:
                 return
             self.noted("depth: the estimate was moved to what the sensor says", run[-1].t + 10.0)
-        self.readmit(run, "five in a row agree with each other")
-
-    def readmit(self, run: list[Entry], reason: str) -> None:
-        """Count records in that were gated."""
-        for entry in list(run):
+        for entry in run:
             self.tracker.regate(entry, False)
-            self.gates[entry.kind].change_mind(entry)
-            self.events.append(Event("readmitted", reason, entry.record, False))
+        self.readmitted(run, "five in a row agree with each other")
 
     def _take_absolute(self, entry: Entry) -> Outcome:
         begin = perf_counter()

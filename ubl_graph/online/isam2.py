@@ -38,7 +38,6 @@ class _Held:
 
     entry: Entry
     slot: int
-    sigma: float
 
 
 class Isam2Engine:
@@ -59,7 +58,13 @@ class Isam2Engine:
         """Begin anew with the next window."""
         self._smoother = None
 
-    def solve(self, window: Window, context: Context, x: FloatArray, most: int) -> Point:  # noqa: ARG002
+    def solve(
+        self,
+        window: Window,
+        context: Context,
+        x: FloatArray,
+        most: int,  # noqa: ARG002 - the protocol's form
+    ) -> Point:
         """Bring the smoother up to date and read the nodes off it.
 
         Raises
@@ -179,7 +184,7 @@ class Isam2Engine:
             problem = Problem(window.layout, tuple(blocks), window.loss, psd)
             for factor in _factors(GraphView(problem, OFFSET + window.first).graph(frozen)):
                 graph.add(factor)
-            held += [_Held(e, -1, float(s)) for e, s in zip(come, frozen[0], strict=True)]
+            held += [_Held(e, -1) for e in come]
         return held
 
 

@@ -236,7 +236,7 @@ def _one_way_range(content: dict[str, Any], setup: Setup) -> OneWayRange:
     return OneWayRange(_beacon(content, setup).name, **values)
 
 
-def _velocity(content: dict[str, Any], setup: Setup) -> Velocity:  # noqa: ARG001
+def _velocity(content: dict[str, Any], setup: Setup) -> Velocity:  # noqa: ARG001 - one form for all
     reference = content.get("reference", "bottom")
     if reference not in ("bottom", "water"):
         raise DataError(
@@ -247,7 +247,7 @@ def _velocity(content: dict[str, Any], setup: Setup) -> Velocity:  # noqa: ARG00
     return Velocity(**numbers_of(content), reference=reference)
 
 
-def _attitude(content: dict[str, Any], setup: Setup) -> Attitude:  # noqa: ARG001
+def _attitude(content: dict[str, Any], setup: Setup) -> Attitude:  # noqa: ARG001 - one form for all
     values = numbers_of(content)
     t = values.pop("t")
     for name in values:
@@ -257,7 +257,7 @@ def _attitude(content: dict[str, Any], setup: Setup) -> Attitude:  # noqa: ARG00
     return Attitude(t, **angles)
 
 
-def _depth(content: dict[str, Any], setup: Setup) -> Depth:  # noqa: ARG001
+def _depth(content: dict[str, Any], setup: Setup) -> Depth:  # noqa: ARG001 - one form for all
     return Depth(**numbers_of(content))
 
 
