@@ -357,9 +357,9 @@ def compete(nodes: int, contest: Contest) -> tuple[dict[str, Timed], list[Pair]]
     dict of str to Timed
         By contestant.
     list of Pair
-        99th percentiles of `lm` and of each other one. The difference is the largest one between
-        newest positions after the same ping; of the smoother that is not iterated, the one after
-        the last ping and further updates, which are not timed.
+        99th percentiles of `lm` and of each other one, and its median and the plain one's. The
+        difference is the largest one between newest positions after the same ping; of the smoother
+        that is not iterated, the one after the last ping and further updates, which are not timed.
     """
     warm = nodes + contest.rest
     stream = pings(warm + max(contest.updates.values()))
@@ -380,6 +380,7 @@ def compete(nodes: int, contest: Contest) -> tuple[dict[str, Timed], list[Pair]]
     rested = plain.newest()[None]
     return timed, [
         _pair("online_vs_plain_custom", nodes, timed, "isam2_plain_custom"),
+        _medians("online_median_vs_plain_custom", nodes, timed, "isam2_plain_custom"),
         _pair("online_vs_plain_one_update", nodes, timed, ONE_UPDATE, rested),
         _pair("online_lm_vs_isam2", nodes, timed, "isam2"),
     ]
@@ -394,6 +395,11 @@ def _pair(
     apart = farthest(ours.positions[count - len(positions) : count], positions)
     p99 = [float(np.percentile(one.seconds, 99)) for one in (ours, theirs)]
     return Pair(name, nodes, *p99, difference=apart, tolerance=TOLERANCE[other])
+
+
+def _medians(name: str, nodes: int, timed: Mapping[str, Timed], other: str) -> Pair:
+    """Medians of `lm` and of another one; whether they agree the 99th percentiles' pair says."""
+    return Pair(name, nodes, *(float(np.median(timed[one].seconds)) for one in ("lm", other)))
 
 
 @contextmanager

@@ -168,7 +168,8 @@ def report_of(**changes):
     for name, values in changes.items():
         ratios[name] = ratios[name] | values
     row = {"seconds": 0.05, "peak_mb": 200.0}
-    return ratios | {"scaling": [row | {"nodes": 1000}, row | {"nodes": 5000}]}
+    leaves = {name: {str(n): {"updates": 3000} for n in script.WINDOWS} for name in online.LISTED}
+    return ratios | {"online": leaves, "scaling": [row | {"nodes": 1000}, row | {"nodes": 5000}]}
 
 
 def test_the_gate_lets_good_numbers_pass():
@@ -193,6 +194,14 @@ def test_the_gate_has_limits_of_its_own(name):
     lenient = {n: dict.fromkeys(BASELINE[n], 100.0) for n in script.TITLES}
     (line,) = script.excesses(report_of(**{name: {nodes: 1.01 * limit}}), lenient)
     assert line.endswith(f"limit {limit:.4g}")
+
+
+def test_the_slowest_hundredth_of_few_updates_is_not_judged():
+    report = report_of(online_vs_plain_custom={"60": 1.0}, online_median_vs_plain_custom={"60": 9})
+    assert len(script.excesses(report, BASELINE)) == 3  # by limit and baseline, and the median
+    report["online"]["isam2_plain_custom"]["60"]["updates"] = 300
+    (line,) = script.excesses(report, BASELINE)
+    assert line.startswith("online_median_vs_plain_custom, 60 nodes")
 
 
 @pytest.mark.parametrize(
