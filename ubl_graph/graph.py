@@ -66,11 +66,12 @@ def model_segment(segment: Segment, options: Options) -> SegmentModel:
     """Derive nodes, attitude and preintegrated odometry of a segment."""
     attitude = AttitudeTrack(segment.attitude)
     by_reference: dict[str, Preintegration] = {}
+    psd = options.number("acceleration_psd")
     if segment.velocity is not None:
         for reference in ("bottom", "water"):
             rows = segment.velocity[segment.velocity.reference == reference]
             if len(rows) > 1:
-                by_reference[reference] = Preintegration(rows, attitude, options.acceleration_psd)
+                by_reference[reference] = Preintegration(rows, attitude, psd)
     odometry = tuple(by_reference.values())
     if options.node_spacing is None:
         times = node_times(segment, options, odometry)
@@ -330,7 +331,10 @@ class Builder:
         """How the slow states wander from node to node."""
         options, layout = self.options, self.layout
         blocks: list[Block] = []
-        walks = {"sound_speed": options.sound_speed_walk, "current": options.current_walk}
+        walks = {
+            "sound_speed": options.number("sound_speed_walk"),
+            "current": options.current_walk,
+        }
         for name, walk in walks.items():
             if layout.has(name):
                 # A walk of zero means a constant; a thousandth of the prior over the whole span

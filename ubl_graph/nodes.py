@@ -19,7 +19,8 @@ NOMINAL_SPEED = 1500.0
 #: sigma: that error is shared by the legs of a ping and by pings close in time, so it must be
 #: well below what a single ping may have.
 INTERPOLATION_SHARE = 0.1
-#: Without any measurement to ask for a node there is one at least every so many seconds.
+#: Without any measurement to ask for a node there is one at least every so many seconds, or at the
+#: distance up to which the prior is as good as known.
 LONGEST_GAP = 10.0
 #: Stamps of one instant may differ by rounding: times nearer than this are one, s.
 SAME_INSTANT = 1e-6
@@ -36,7 +37,7 @@ ROUND_SPACINGS = (0.1, 0.2, 0.25, 0.5, 1.0)
 
 def order_of(options: Options) -> Order:
     """Order of the motion prior that the options ask for."""
-    return 2 if options.motion == "constant_velocity" else 3
+    return 2 if options.is_constant_velocity else 3
 
 
 def node_times(
@@ -65,7 +66,9 @@ def node_times(
     if len(wanted) > 1:
         nearer = kept - wanted[before] < wanted[after] - kept
         stay[np.where(nearer, before, after)] = True
-    return _filled(_thinned(wanted, stay, spacing, LEAST_SHARE[order] * spacing))
+    least = LEAST_SHARE[order] * spacing
+    longest = max(LONGEST_GAP, least, _shared_spacing(order, spacing, segment))
+    return _filled(_thinned(wanted, stay, min(spacing, longest), least), longest)
 
 
 def grid_times(
@@ -104,7 +107,7 @@ def grid_spacing(options: Options) -> float:
     """
     if options.node_spacing is not None:
         return options.node_spacing
-    sigma = INTERPOLATION_SHARE * options.travel_time_sigma * NOMINAL_SPEED / 2.0
+    sigma = INTERPOLATION_SHARE * options.number("travel_time_sigma") * NOMINAL_SPEED / 2.0
     longest = longest_interval(order_of(options), options.horizontal_psd, sigma)
     return max((s for s in ROUND_SPACINGS if s <= longest), default=ROUND_SPACINGS[0])
 
@@ -165,10 +168,25 @@ def _thinned(times: FloatArray, must_stay: BoolArray, spacing: float, least: flo
     return np.array([*chosen, times[-1]])
 
 
-def _filled(times: FloatArray) -> FloatArray:
-    """Split gaps longer than `LONGEST_GAP` into equal parts."""
+def _shared_spacing(order: Order, spacing: float, segment: Segment) -> float:
+    """What `spacing` (s) shrinks to where several pings share an interval, and its error.
+
+    The interpolation's variance grows with the interval to the third or fifth power (WNOA, WNOJ),
+    and as the pings in it have that error in common it must stay under the noise of their mean.
+    """
+    ranges = [r for r in (segment.two_way_range, segment.one_way_range) if r is not None]
+    times = np.concatenate([r.t_receive for r in ranges]) if ranges else np.empty(0)
+    span = float(np.ptp(times)) if len(times) else 0.0
+    if span * spacing == 0.0:
+        return spacing
+    power = 2 * order - 1
+    return min(spacing, (spacing**power * span / len(times)) ** (1.0 / (power + 1)))
+
+
+def _filled(times: FloatArray, longest: float) -> FloatArray:
+    """Split gaps longer than `longest` (s) into equal parts."""
     gaps = np.diff(times)
-    parts = np.maximum(np.ceil(gaps / LONGEST_GAP - 1e-9), 1.0).astype(np.int64)
+    parts = np.maximum(np.ceil(gaps / longest - 1e-9), 1.0).astype(np.int64)
     if (parts == 1).all():
         return times
     pieces = [t + gap / n * np.arange(n) for t, gap, n in zip(times[:-1], gaps, parts, strict=True)]

@@ -7,16 +7,22 @@ they stand under `[options]` in a mission file.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 from ubl_graph.errors import ConfigurationError
 
 Motion = Literal["constant_velocity", "constant_acceleration"]
+#: In place of a value: `smooth` chooses it by the data's own likelihood.
+Auto = Literal["auto"]
 Loss = Literal["cauchy", "huber", "geman_mcclure", "dcs", "none"]
 Rays = Literal["auto", "straight", "eigenray"]
 Solver = Literal["auto", "gtsam", "banded"]
 OnlineEngine = Literal["lm", "isam2"]
+
+#: What the options that are left to the data say, and which ones may.
+AUTO: Auto = "auto"
+AUTOMATIC = ("motion", "acceleration_psd", "jerk_psd", "travel_time_sigma", "sound_speed_walk")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,19 +35,21 @@ class Options:
         Where a value is of the wrong kind, not finite, or outside its range.
     """
 
-    motion: Motion = "constant_velocity"
-    """Motion prior between nodes: white noise on acceleration or on jerk."""
+    motion: Motion | Auto = "constant_velocity"
+    """Motion prior between nodes: white noise on acceleration or on jerk; "auto" takes the one
+    that makes the data more likely."""
 
-    acceleration_psd: float = 2e-3
+    acceleration_psd: float | Auto = 2e-3
     """Horizontal acceleration noise of the constant-velocity prior, m^2/s^3. After a time t an
-    unaided velocity has drifted by sqrt(psd t): 0.45 m/s in 100 s."""
+    unaided velocity has drifted by sqrt(psd t): 0.45 m/s in 100 s. "auto" chooses it, and the
+    vertical one where that is left out, by marginal likelihood."""
 
     vertical_acceleration_psd: float | None = None
     """The same for the vertical; left out, it equals the horizontal one (for a surface vessel,
     which heaves, a garpos mission takes 0.3)."""
 
-    jerk_psd: float = 1e-5
-    """Horizontal jerk noise of the constant-acceleration prior, m^2/s^5."""
+    jerk_psd: float | Auto = 1e-5
+    """Horizontal jerk noise of the constant-acceleration prior, m^2/s^5; "auto" as above."""
 
     vertical_jerk_psd: float | None = None
     """The same for the vertical; left out, it equals the horizontal one."""
@@ -57,8 +65,9 @@ class Options:
     """Travel times along straight lines at the harmonic-mean speed, or along eigenrays; auto
     takes eigenrays where the sound speed is a profile."""
 
-    travel_time_sigma: float = 1e-4
-    """Standard deviation of a travel time where the data give none, s."""
+    travel_time_sigma: float | Auto = 1e-4
+    """Standard deviation of a travel time where the data give none, s. "auto" multiplies those of
+    all travel times, 1e-4 s where the data give none, by a factor that it finds."""
 
     estimate_sound_speed: bool = True
     """Whether a slowly varying scale of the sound speed is estimated."""
@@ -67,8 +76,9 @@ class Options:
     """Relative standard deviation of the sound speed at a segment's start. Left out: 1e-3 for a
     profile (1.5 m/s), 5e-3 for a constant (7.5 m/s, the spread of column means at sea)."""
 
-    sound_speed_walk: float = 2e-6
-    """Random walk of the relative sound speed, 1/sqrt(s): 1.2e-4 (0.18 m/s) in an hour."""
+    sound_speed_walk: float | Auto = 2e-6
+    """Random walk of the relative sound speed, 1/sqrt(s): 1.2e-4 (0.18 m/s) in an hour; "auto" as
+    above."""
 
     estimate_beacons: bool = False
     """False: beacons are constants. True: unknowns with their `sigma` as prior."""
@@ -132,9 +142,9 @@ class Options:
             value = getattr(self, f.name)
             kind = str(f.type)
             if kind.startswith("float"):
-                self._check_number(f.name, value, optional="None" in kind)
+                self._check_number(f.name, value, optional="None" in kind, auto="Auto" in kind)
         choices: dict[str, tuple[str, ...]] = {
-            "motion": ("constant_velocity", "constant_acceleration"),
+            "motion": ("constant_velocity", "constant_acceleration", AUTO),
             "loss": ("cauchy", "huber", "geman_mcclure", "dcs", "none"),
             "rays": ("auto", "straight", "eigenray"),
             "solver": ("auto", "gtsam", "banded"),
@@ -160,8 +170,10 @@ class Options:
                 field="options.max_iterations",
             )
 
-    def _check_number(self, name: str, value: float | None, *, optional: bool) -> None:
-        if value is None and optional:
+    def _check_number(
+        self, name: str, value: float | str | None, *, optional: bool, auto: bool
+    ) -> None:
+        if (value is None and optional) or (value == AUTO and auto):
             return
         may_vanish = name.startswith(("dvl_", "sound_speed_", "current_walk", "clock_"))
         if (
@@ -171,22 +183,68 @@ class Options:
             or value < 0.0
             or (value == 0.0 and not may_vanish)
         ):
+            kind = "non-negative" if may_vanish else "positive"
             raise ConfigurationError(
-                f"{value} is not a {'non-negative' if may_vanish else 'positive'} number",
+                f"{value} is not a {kind} number" + (f" or '{AUTO}'" if auto else ""),
                 field=f"options.{name}",
             )
+
+    @property
+    def automatic(self) -> tuple[str, ...]:
+        """Names of the options that are left to the data ("auto")."""
+        return tuple(name for name in AUTOMATIC if getattr(self, name) == AUTO)
+
+    @property
+    def settled(self) -> Options:
+        """The same with the defaults in place of what is left to the data."""
+        defaults = {f.name: f.default for f in fields(self)}
+        return replace(self, **{name: defaults[name] for name in self.automatic})
 
     @property
     def vertical_psd(self) -> float:
         """Vertical noise density of the motion prior in force, m^2/s^3 or m^2/s^5."""
         given = (
-            self.vertical_acceleration_psd
-            if self.motion == "constant_velocity"
-            else self.vertical_jerk_psd
+            self.vertical_acceleration_psd if self.is_constant_velocity else self.vertical_jerk_psd
         )
         return self.horizontal_psd if given is None else given
 
     @property
     def horizontal_psd(self) -> float:
         """Horizontal noise density of the motion prior in force, m^2/s^3 or m^2/s^5."""
-        return self.acceleration_psd if self.motion == "constant_velocity" else self.jerk_psd
+        return self.number("acceleration_psd" if self.is_constant_velocity else "jerk_psd")
+
+    @property
+    def is_constant_velocity(self) -> bool:
+        """Whether the motion prior is white noise on acceleration, not on jerk."""
+        self._refuse_automatic("motion")
+        return self.motion == "constant_velocity"
+
+    def number(self, name: str) -> float:
+        """Value of an option that may be left to the data.
+
+        Raises
+        ------
+        ConfigurationError
+            Where it is: only `smooth` chooses, from a whole mission.
+        """
+        self._refuse_automatic(name)
+        return float(getattr(self, name))
+
+    def require_settled(self) -> None:
+        """Refuse options that are left to the data.
+
+        Raises
+        ------
+        ConfigurationError
+            Where there are any.
+        """
+        for name in self.automatic:
+            self._refuse_automatic(name)
+
+    def _refuse_automatic(self, name: str) -> None:
+        if getattr(self, name) == AUTO:
+            raise ConfigurationError(
+                f"'{AUTO}' is for whole missions",
+                "smooth a recorded one with it and give the value that result.json names",
+                field=f"options.{name}",
+            )

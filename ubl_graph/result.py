@@ -12,6 +12,7 @@ from ubl_graph.arrays import BoolArray, FloatArray
 from ubl_graph.errors import ConfigurationError, TimeError
 from ubl_graph.mission import Mission
 from ubl_graph.trajectory import States, Trajectory
+from ubl_graph.tuning import Tuning
 
 Status = Literal["converged", "not converged", "unobservable"]
 
@@ -168,6 +169,8 @@ class Result:
         What a user should know before trusting it.
     wall_times : dict of str to float
         Seconds by stage.
+    tuning : Tuning or None
+        What the data chose where options were "auto"; `mission` holds the numbers.
     """
 
     mission: Mission
@@ -176,6 +179,7 @@ class Result:
     shared: dict[str, Shared]
     warnings: tuple[str, ...] = ()
     wall_times: dict[str, float] = field(default_factory=dict[str, float])
+    tuning: Tuning | None = None
 
     @property
     def status(self) -> Status:

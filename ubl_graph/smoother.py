@@ -25,6 +25,7 @@ from ubl_graph.solve.choice import Choice, choose
 from ubl_graph.solve.marginals import Marginals
 from ubl_graph.solve.rounds import Engine, Solution, confirms, graduated, solve
 from ubl_graph.track import Track, mirror_images, place, track_of, unanchored
+from ubl_graph.tuning import Tuning, tuned
 
 #: A second track counts as no worse where its cost is higher by less than this: odds of 20 to 1.
 AMBIGUOUS_COST = 3.0
@@ -76,6 +77,8 @@ def smooth(mission: Mission, progress: Progress | None = None) -> Result:
     'converged'
     """
     work = _Work(mission, progress)
+    tuning = _tune(work)
+    mission = work.mission
     _judge_profile(work)
     with work.stage("model"):
         models = [model_segment(segment, mission.options) for segment in mission.segments]
@@ -92,7 +95,22 @@ def smooth(mission: Mission, progress: Progress | None = None) -> Result:
         _judge(work, segment)
     beacons = beacons_of(mission, shared)
     shared = {name: s for name, s in shared.items() if not name.startswith("beacon ")}
-    return Result(mission, tuple(segments), beacons, shared, tuple(work.warnings), work.wall_times)
+    return Result(
+        mission, tuple(segments), beacons, shared, tuple(work.warnings), work.wall_times, tuning
+    )
+
+
+def _tune(work: _Work) -> Tuning | None:
+    """Put numbers where the options say "auto"."""
+    automatic = work.mission.options.automatic
+    if not automatic:
+        return None
+    with work.stage("noise"):
+        work.mission, tuning = tuned(work.mission, lambda share: work.tell("noise", share))
+    work.reset()
+    if tuning.trouble:
+        work.warn("", f"{', '.join(automatic)}: the defaults stand; {tuning.trouble}")
+    return tuning
 
 
 def _judge_profile(work: _Work) -> None:
@@ -284,6 +302,10 @@ class _Work:
     _done: float = 0.0
     _share: float = 1.0
     _told: float = 0.0
+
+    def reset(self) -> None:
+        """Count progress from the beginning."""
+        self._told = 0.0
 
     def begin(self, done: float, share: float) -> None:
         self._done, self._share = done, share

@@ -58,9 +58,9 @@ def _reckon(mission: Mission, segment: Segment, start: Start | None) -> Trajecto
         )
     if start is None:
         raise UnobservableError(f"{where} has no start; dead reckoning has to begin somewhere")
-    options, arm = mission.options, mission.vehicle.dvl
+    options, arm = mission.options.settled, mission.vehicle.dvl
     attitude = AttitudeTrack(segment.attitude)
-    samples = Preintegration(rows, attitude, options.acceleration_psd)
+    samples = Preintegration(rows, attitude, options.number("acceleration_psd"))
     t = samples.t
     # Outside the samples the integral stands still; the first or last velocity bridges to there.
     nearest = float(np.clip(start.t, t[0], t[-1]))
@@ -84,7 +84,7 @@ def _reckon(mission: Mission, segment: Segment, start: Start | None) -> Trajecto
         position[:, 2] = -np.interp(t, depth.t, depth.depth) - up
         covariance[:, 2, :] = covariance[:, :, 2] = 0.0
         covariance[:, 2, 2] = np.interp(t, depth.t, depth.sigma) ** 2
-    psd = options.acceleration_psd
+    psd = options.number("acceleration_psd")
     return Trajectory(t, position, velocity, None, covariance, (psd, psd))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -64,6 +65,9 @@ class LinearBlock:
         Whitened Jacobian; zero at padded columns.
     target : array, shape (M, R)
         Whitened right-hand side b.
+    log_det : callable, optional
+        Gives the sum over the rows of the logarithm of what whitened them (of its determinant): the
+        densities' own factor, which a likelihood wants and no step does. Left out, it is constant.
     """
 
     name: str
@@ -72,6 +76,7 @@ class LinearBlock:
     target: FloatArray
     linear: bool = True
     robust: bool = False
+    log_det: Callable[[], float] | None = None
 
     def frozen(self, x: FloatArray) -> FloatArray | None:  # noqa: ARG002 - the protocol's form
         """Nothing changes with the state."""

@@ -37,11 +37,13 @@ def motion(layout: Layout, chain: Chain, psd: FloatArray) -> LinearBlock:
     for axis in range(3):
         matrix[:, :, axis, :, axis] = ends / np.sqrt(psd[:, axis])[:, None, None]
     columns = [layout.node_columns(q, k + e) for e in (0, 1) for q in KINEMATIC[:n]]
+    matrix = matrix.reshape(len(dt), 3 * n, 6 * n)
     return LinearBlock(
         "motion",
         np.concatenate(columns, axis=1),
-        matrix.reshape(len(dt), 3 * n, 6 * n),
+        matrix,
         np.zeros((len(dt), 3 * n)),
+        log_det=lambda: _log_det(matrix[:, :, 3 * n :]),
     )
 
 
@@ -57,6 +59,7 @@ def random_walk(layout: Layout, chain: Chain, name: str, walk: float) -> LinearB
         np.concatenate([before, after], axis=1),
         inverse[:, None, None] * step,
         np.zeros((len(inverse), size)),
+        log_det=lambda: size * float(np.log(inverse).sum()),
     )
 
 
@@ -91,11 +94,13 @@ def clock_walk(layout: Layout, chain: Chain, offset_walk: float, drift_walk: flo
     states = ("clock_offset", "clock_drift")
     columns = [layout.node_columns(name, k + end) for end in (0, 1) for name in states]
     units = np.tile([layout.unit(name) for name in states], 2)
+    matrix = np.concatenate([-w @ phi, w], axis=2) * units
     return LinearBlock(
         "clock walk",
         np.concatenate(columns, axis=1),
-        np.concatenate([-w @ phi, w], axis=2) * units,
+        matrix,
         np.zeros((len(dt), 2)),
+        log_det=lambda: _log_det(matrix[:, :, 2:]),
     )
 
 
@@ -121,6 +126,7 @@ def depth(
         position.columns[:, :, 2],
         (position.weights * inverse[:, None])[:, None, :],
         (-(measured + lever_up) * inverse)[:, None],
+        log_det=lambda: float(np.log(inverse).sum()),
     )
 
 
@@ -141,13 +147,14 @@ def position_fix(
         m^2, the interpolation's included.
     """
     m, d = measured.shape
-    w = np.linalg.inv(np.linalg.cholesky(covariance))
+    w: FloatArray = np.linalg.inv(np.linalg.cholesky(covariance))
     matrix = w[:, :, None, :] * position.weights[:, None, :, None]
     return LinearBlock(
         "position",
         position.columns[:, :, :d].reshape(m, -1),
         matrix.reshape(m, d, -1),
         np.einsum("mrc,mc->mr", w, measured - lever[:, :d]),
+        log_det=lambda: _log_det(w),
     )
 
 
@@ -158,4 +165,16 @@ def prior(name: str, columns: IntArray, mean: FloatArray, sigma: FloatArray) -> 
     """
     inverse = 1.0 / np.broadcast_to(np.asarray(sigma, dtype=np.float64), columns.shape)
     matrix = inverse[:, :, None] * np.eye(columns.shape[1])
-    return LinearBlock(f"{name} prior", columns, matrix, inverse * mean)
+    known = inverse[inverse > 0.0]
+    return LinearBlock(
+        f"{name} prior",
+        columns,
+        matrix,
+        inverse * mean,
+        log_det=lambda: float(np.log(known).sum()),
+    )
+
+
+def _log_det(matrices: FloatArray) -> float:
+    """Sum of the logarithms of the determinants of square matrices (M, R, R)."""
+    return float(np.linalg.slogdet(matrices)[1].sum())

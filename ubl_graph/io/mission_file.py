@@ -127,7 +127,7 @@ def _garpos_mission(document: GarposDocument, path: Path) -> Mission:
             folder / data.config,
             None if data.beacons is None else folder / data.beacons,
             data.lines,
-            options.travel_time_sigma,
+            options.settled.number("travel_time_sigma"),
         )
     if isinstance(data.sound_speed, str):
         profile = records.read_sound_speed(folder / data.sound_speed)
@@ -208,7 +208,7 @@ def _read_records(
     options: Options,
     origin: GeodeticOrigin | None,
 ) -> dict[str, Any]:
-    sigma = options.travel_time_sigma
+    sigma = options.settled.number("travel_time_sigma")
     readers: dict[str, Callable[[Path], Records]] = {
         "two_way_range": lambda file: records.read_two_way_range(file, beacons, sigma),
         "one_way_range": lambda file: records.read_one_way_range(file, sigma),

@@ -256,7 +256,7 @@ class Core(Finder):
         arm = self.setup.vehicle.depth_sensor
         slack = 0.0 if arm.is_zero else float(np.linalg.norm(arm.body))
         away = max(abs(m.mean[2] + dt * m.mean[5] + entry.values[1]) - slack, 0.0)
-        if self.setup.options.motion == "constant_velocity":
+        if self.setup.options.is_constant_velocity:
             # What a dive would excuse once the motion prior does not expect again and again.
             self.gates["depth"].surprises.append(away * away / max(known + psd * cube, 1e-12))
         return away / math.sqrt(max(variance, 1e-12)), 1

@@ -92,6 +92,7 @@ class FixedLagEstimator:
         return made
 
     def _begin(self, setup: Setup) -> None:
+        setup.options.require_settled()
         self.setup = setup
         self.core = Core(setup)
 

@@ -229,7 +229,7 @@ def _modelled(
     for reference in by_reference if attitude is not None else ():
         rows = [e for e in velocity if e.values[-1] == reference]
         if len(rows) > 1 and _known(frame, reference):
-            psd = frame.setup.options.acceleration_psd
+            psd = frame.setup.options.number("acceleration_psd")
             by_reference[reference] = Preintegration(
                 columns_of("velocity", rows), track, psd, frame.gap
             )
