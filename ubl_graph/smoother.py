@@ -24,7 +24,7 @@ from ubl_graph.result import DOWN_WEIGHTED, Result, SegmentResult, Shared
 from ubl_graph.solve.choice import Choice, choose
 from ubl_graph.solve.marginals import Marginals
 from ubl_graph.solve.rounds import Engine, Solution, confirms, graduated, solve
-from ubl_graph.track import Track, mirror_images, place, track_of, unanchored
+from ubl_graph.track import mirror_images, start_vector, track_of, unanchored
 from ubl_graph.tuning import Tuning, tuned
 
 #: A second track counts as no worse where its cost is higher by less than this: odds of 20 to 1.
@@ -211,7 +211,7 @@ def _solve_from(
     Returns the cheapest solution, and the others, cheapest first.
     """
     problem = engine.problem
-    begin = _vector(work.mission, problem, [s.tracks[0] for s in starts])
+    begin = start_vector(work.mission, problem.layout, [s.tracks[0] for s in starts])
     solutions = [work.solve(engine, begin)]
     if _down_weighted(problem, solutions[0]) > DOUBTFUL_SHARE:
         solutions.append(work.solve(engine, graduated(engine, begin)))
@@ -221,7 +221,7 @@ def _solve_from(
         if unanchored(group[0]) is None:
             found = track_of(problem.layout, problem.layout.chains[0], solutions[0].x)
             rivals += mirror_images(work.mission, group[0], found)
-        starts_at = [_vector(work.mission, problem, [track]) for track in rivals]
+        starts_at = [start_vector(work.mission, problem.layout, [track]) for track in rivals]
         solutions += [work.solve(engine, x) for x in starts_at]
     # Mirror images cost the same but for rounding: of equals the first stays the answer.
     least = min(s.cost for s in solutions)
@@ -278,17 +278,6 @@ def _rival(
                 "would tell"
             ), problem.layout.get(other.x, "position")
     return None, None
-
-
-def _vector(mission: Mission, problem: Problem, tracks: Sequence[Track]) -> FloatArray:
-    """The flat vector that a solver starts at: the tracks, beacons where they are, else zero."""
-    x = np.zeros(problem.layout.size)
-    for chain, track in zip(problem.layout.chains, tracks, strict=True):
-        place(problem.layout, chain, track, x)
-    for beacon in mission.beacons:
-        if problem.layout.has(f"beacon {beacon.name}"):
-            problem.layout.put(x, f"beacon {beacon.name}", beacon.position)
-    return x
 
 
 @dataclass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from ubl_graph.arrays import FloatArray
 from ubl_graph.graph import SegmentModel
 from ubl_graph.layout import Chain, Layout
 from ubl_graph.mission import Mission
+from ubl_graph.trajectory import Trajectory
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +66,49 @@ def track_of(layout: Layout, chain: Chain, x: FloatArray) -> Track:
         read("sound_speed", 1)[:, 0],
         read("clock_offset", 1)[:, 0],
         0.0,
+    )
+
+
+def start_vector(mission: Mission, layout: Layout, tracks: Sequence[Track]) -> FloatArray:
+    """The flat vector that a solver starts at: the tracks, beacons where they are, else zero."""
+    x = np.zeros(layout.size)
+    for chain, track in zip(layout.chains, tracks, strict=True):
+        place(layout, chain, track, x)
+    for beacon in mission.beacons:
+        if layout.has(f"beacon {beacon.name}"):
+            layout.put(x, f"beacon {beacon.name}", beacon.position)
+    return x
+
+
+def carried(old: Layout, x: FloatArray, new: Layout) -> FloatArray:
+    """An estimate in another layout of the same segments, whose nodes may stand elsewhere.
+
+    What travels with the nodes is interpolated, what all of them share stays.
+    """
+    out = np.zeros(new.size)
+    for before, after in zip(old.chains, new.chains, strict=True):
+        track = track_of(old, before, x)
+        if not np.array_equal(before.t, after.t):
+            track = _resampled(track, before.t, after.t)
+        place(new, after, track, out)
+    for name, _ in new.shared:
+        out[new.shared_columns(name)] = x[old.shared_columns(name)]
+    return out
+
+
+def _resampled(track: Track, old: FloatArray, new: FloatArray) -> Track:
+    """A track at other times of its span."""
+    none = np.zeros((len(old), 3, 3))
+    acceleration = track.acceleration if track.acceleration.any() else None
+    path = Trajectory(old, track.position, track.velocity, acceleration, none, (0.0, 0.0))
+    states = path.at(new)
+    return replace(
+        track,
+        position=states.position,
+        velocity=states.velocity,
+        acceleration=np.stack([np.interp(new, old, a) for a in track.acceleration.T], axis=1),
+        scale=np.interp(new, old, track.scale),
+        clock=np.interp(new, old, track.clock),
     )
 
 

@@ -18,20 +18,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from ubl_graph.arrays import FloatArray
 from ubl_graph.errors import SolverError
 from ubl_graph.factors import linear
 from ubl_graph.graph import SegmentModel, build_problem, model_segment
 from ubl_graph.initial import START_LIMIT, find_starts
-from ubl_graph.layout import Layout
 from ubl_graph.measurements import OneWayRange, TwoWayRange
 from ubl_graph.mission import Mission, Segment
 from ubl_graph.nodes import NOMINAL_SPEED, node_times
 from ubl_graph.options import AUTO, Motion, Options
 from ubl_graph.problem import Problem
 from ubl_graph.solve.evidence import log_evidence
-from ubl_graph.track import Track, place, track_of
-from ubl_graph.trajectory import Trajectory
+from ubl_graph.track import Track, carried, start_vector
 
 #: The first acceleration of a vehicle under water is zero within this, m/s^2. The smoother takes
 #: next to nothing for known; a likelihood would hold that against the model that has one.
@@ -51,12 +48,14 @@ LEAST_NOISE: dict[Motion, float] = {"constant_velocity": 1e-6, "constant_acceler
 FACTORS, WALKS = (0.03, 100.0), (1e-8, 1e-3)
 #: Stands for the infinite cost of noise under which nothing can be solved.
 IMPOSSIBLE = 1e12
+#: What a stated sigma of the travel times is worth, in decades: right within a factor of three.
+STATED_SPREAD = 0.5
 #: Numbers are found to this share of a decade,
 TOLERANCE = 0.1
 #: and all of them are gone through until a pass makes the data less than so much more likely,
 WORTH_A_PASS = 0.1
-#: at most so often.
-MOST_PASSES = 4
+#: at most so often, the later ones in steps smaller by this.
+MOST_PASSES, LATER_STEPS = 4, 0.3
 
 #: Called with how far the search is, 0 to 1.
 Progress = Callable[[float], None]
@@ -122,7 +121,7 @@ def tuned(mission: Mission, progress: Progress | None = None) -> tuple[Mission, 
     if not np.isfinite(best.best):
         trouble = "the data do not determine the track, whatever the noise"
         return settled, Tuning({}, 1.0, {}, 0, trouble)
-    out = best.posed(best.at)
+    out = best.answer()
     chosen: dict[str, float | str] = {
         name: getattr(out.options, name)
         for name in (*asked.automatic, *best.vertical)
@@ -132,7 +131,7 @@ def tuned(mission: Mission, progress: Progress | None = None) -> tuple[Mission, 
         chosen = {"motion": best.motion, **chosen}
     tuning = Tuning(
         chosen,
-        10.0 ** best.at.get("travel_time_sigma", 0.0),
+        best.factor,
         {motion: search.best for motion, search in found.items()},
         sum(search.evaluations for search in found.values()),
     )
@@ -193,7 +192,7 @@ class _Search:
         self.at = {name: knob.start for name, knob in self._knobs.items()}
         self.evaluations = 0
         problem = self._problem(self.at)[1]
-        self._x, self._layout = _placed(problem.layout, tracks), problem.layout
+        self._x, self._layout = start_vector(self._mission, problem.layout, tracks), problem.layout
         self.best = -np.inf
         self.best = self._evaluate(self.at)
 
@@ -214,11 +213,20 @@ class _Search:
             before = self.best
             for k, (name, knob) in enumerate(self._knobs.items()):
                 progress((number + k / len(self._knobs)) / passes)
-                self._line(name, knob)
+                self._line(name, knob, knob.step if number == 0 else LATER_STEPS * knob.step)
             if self.best - before < WORTH_A_PASS:
                 break
 
-    def posed(self, at: dict[str, float]) -> Mission:
+    def answer(self) -> Mission:
+        """The mission with the numbers that are the best."""
+        return self._posed(self.at)
+
+    @property
+    def factor(self) -> float:
+        """On the travel times' sigmas."""
+        return 10.0 ** self.at.get("travel_time_sigma", 0.0)
+
+    def _posed(self, at: dict[str, float]) -> Mission:
         """The mission with these numbers."""
         values = {name: 10.0**u for name, u in at.items()}
         factor = values.pop("travel_time_sigma", 1.0)
@@ -268,8 +276,9 @@ class _Search:
             least = min(least, factor * moved**2 / span**power)
         return least
 
-    def _line(self, name: str, knob: _Knob) -> None:
+    def _line(self, name: str, knob: _Knob, step: float) -> None:
         """Search one number, the others held: bracket the best value in steps, then narrow down."""
+        first = step
         tried = {self.at[name]: self.best}
 
         def value(u: float) -> float:
@@ -280,7 +289,7 @@ class _Search:
 
         middle = self.at[name]
         for sign in (-1.0, 1.0):
-            step = knob.step
+            step = first
             while value(middle + sign * step) > tried[middle]:
                 middle = float(np.clip(middle + sign * step, knob.low, knob.high))
                 step *= 1.5
@@ -299,7 +308,7 @@ class _Search:
             )
 
     def _problem(self, at: dict[str, float]) -> tuple[Mission, Problem]:
-        mission = self.posed(at)
+        mission = self._posed(at)
         models = [
             self._remodelled(model, segment, mission.options)
             for model, segment in zip(self._models, mission.segments, strict=True)
@@ -324,13 +333,14 @@ class _Search:
         """Logarithm of the likelihood; the best so far is kept."""
         self.evaluations += 1
         problem = self._problem(at)[1]
-        x = _carried(self._layout, self._x, problem.layout)
+        x = carried(self._layout, self._x, problem.layout)
         try:
             value, x = log_evidence(problem, x)
         except SolverError:
             if not np.isfinite(self.best):
                 raise
             return -np.inf
+        value -= 0.5 * (at.get("travel_time_sigma", 0.0) / STATED_SPREAD) ** 2
         if value > self.best:
             self.best, self.at, self._x, self._layout = value, at, x, problem.layout
         return value
@@ -377,41 +387,4 @@ def _scaled(segment: Segment, factor: float) -> Segment:
         segment,
         two_way_range=None if two_way is None else replace(two_way, sigma=factor * two_way.sigma),
         one_way_range=None if one_way is None else replace(one_way, sigma=factor * one_way.sigma),
-    )
-
-
-def _placed(layout: Layout, tracks: Sequence[Track]) -> FloatArray:
-    x = np.zeros(layout.size)
-    for chain, track in zip(layout.chains, tracks, strict=True):
-        place(layout, chain, track, x)
-    return x
-
-
-def _carried(old: Layout, x: FloatArray, new: Layout) -> FloatArray:
-    """An estimate on other nodes; what all nodes share stays."""
-    out = np.zeros(new.size)
-    for before, after in zip(old.chains, new.chains, strict=True):
-        if len(before.t) == len(after.t) and (before.t == after.t).all():
-            track = track_of(old, before, x)
-        else:
-            track = _resampled(track_of(old, before, x), before.t, after.t)
-        place(new, after, track, out)
-    for name, _ in new.shared:
-        out[new.shared_columns(name)] = x[old.shared_columns(name)]
-    return out
-
-
-def _resampled(track: Track, old: FloatArray, new: FloatArray) -> Track:
-    """A track at other times of its span."""
-    none = np.zeros((len(old), 3, 3))
-    acceleration = track.acceleration if track.acceleration.any() else None
-    path = Trajectory(old, track.position, track.velocity, acceleration, none, (0.0, 0.0))
-    states = path.at(new)
-    return replace(
-        track,
-        position=states.position,
-        velocity=states.velocity,
-        acceleration=np.stack([np.interp(new, old, a) for a in track.acceleration.T], axis=1),
-        scale=np.interp(new, old, track.scale),
-        clock=np.interp(new, old, track.clock),
     )

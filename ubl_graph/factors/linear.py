@@ -147,14 +147,14 @@ def position_fix(
         m^2, the interpolation's included.
     """
     m, d = measured.shape
-    w: FloatArray = np.linalg.inv(np.linalg.cholesky(covariance))
+    w = np.linalg.inv(np.linalg.cholesky(covariance))
     matrix = w[:, :, None, :] * position.weights[:, None, :, None]
     return LinearBlock(
         "position",
         position.columns[:, :, :d].reshape(m, -1),
         matrix.reshape(m, d, -1),
         np.einsum("mrc,mc->mr", w, measured - lever[:, :d]),
-        log_det=lambda: _log_det(w),
+        log_det=lambda: -0.5 * _log_det(covariance),
     )
 
 

@@ -82,8 +82,8 @@ def load_setup(path: str | Path) -> Setup:
     DataError
         Where a file cannot be read, or a value in it is wrong; it names file and field.
     ConfigurationError
-        Where the file is no TOML, a key is unknown or missing, a value is of the wrong kind, or
-        data are named; it names the file and the key.
+        Where the file is no TOML, a key is unknown or missing, a value is of the wrong kind, data
+        are named, or an option is left to the data; it names the file and the key.
     """
     path = Path(path)
     content = _parsed(path)
@@ -99,7 +99,9 @@ def load_setup(path: str | Path) -> Setup:
     assert isinstance(document, CsvDocument)
     _check_sound_speed(document, path, needed=bool(document.beacon), why="there are beacons")
     with naming(path):
-        return Setup(**_parts(document, path))
+        setup = Setup(**_parts(document, path))
+        setup.options.require_settled()
+        return setup
 
 
 def _parsed(path: Path) -> dict[str, Any]:

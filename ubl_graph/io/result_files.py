@@ -13,6 +13,7 @@ import shutil
 import tempfile
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -128,6 +129,7 @@ def summary(result: Result) -> dict[str, Any]:
             for name, s in result.shared.items()
         },
         "segments": [_segment_summary(s, errors.get(s.name)) for s in result.segments],
+        **({} if result.tuning is None else {"tuning": asdict(result.tuning)}),
         "wall_times_s": {name: round(t, 4) for name, t in result.wall_times.items()},
         "versions": versions(),
     }

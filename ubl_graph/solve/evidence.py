@@ -9,15 +9,19 @@ other motion noise, other nodes, another order of the prior. For linear rows and
 exact (MacKay 1992, Bayesian interpolation; for Gaussian processes Rasmussen and Williams 2006,
 sect. 5.4). H comes from the banded solver, as the covariances do.
 
-A robust loss stands for no normal density. Its rows count log sigma by the share that makes the
-answer right for normal noise (Huber's proposal 2): without it every sigma would come out too small.
+A robust loss is a good guide to the track and a poor density. Where the problem has one, a ping
+either has normal noise or is an outlier that may lie anywhere within a tenth of a second, whichever
+is likelier at the robust track (Torr and Zisserman 2000, MLESAC).
 """
 
 from __future__ import annotations
 
+from copy import copy
+from dataclasses import replace
+
 import numpy as np
 
-from ubl_graph.arrays import FloatArray
+from ubl_graph.arrays import BoolArray, FloatArray
 from ubl_graph.errors import SolverError
 from ubl_graph.factors.block import LinearBlock
 from ubl_graph.factors.loss import RobustLoss
@@ -30,10 +34,12 @@ from ubl_graph.solve.normal import NormalEquations, Point
 AT_REST = 1e-3
 #: Iterations of a descent, at most: whoever begins that far off is no good answer.
 MOST_ITERATIONS = 40
-#: The interpolation's variance is taken anew so often.
+#: The interpolation's variance, and which pings are outliers, are taken anew so often.
 ROUNDS = 2
-#: Nodes of the Gauss-Hermite rule for the robust rows' share.
-QUADRATURE = 64
+#: Outliers are one ping in twenty, and lie within so many seconds of the truth on either side.
+OUTLIERS, FARTHEST = 0.05, 0.1
+#: By so much an outlier's standard deviation is multiplied: it counts for nothing.
+IGNORED = 1e6
 
 
 def log_evidence(problem: Problem, x: FloatArray) -> tuple[float, FloatArray]:
@@ -63,17 +69,58 @@ def log_evidence(problem: Problem, x: FloatArray) -> tuple[float, FloatArray]:
     for _ in range(ROUNDS):
         x = _minimum(equations, x, frozen)
         before, frozen = frozen, problem.frozen(x)
-        if all(b is None or np.allclose(a, b, 1e-3, 0.0) for a, b in _pairs(frozen, before)):
+        if _same(before, frozen):
             break
-    point = equations.evaluate(x, frozen)
+    used, log_outliers = frozen, 0.0
+    if problem.loss.name != "none":
+        equations = _normal(equations)
+        for _ in range(ROUNDS):
+            used, log_outliers = _without_outliers(equations.problem, x, frozen)
+            x = _minimum(equations, x, used)
+    point = equations.evaluate(x, used)
     half_log_det = _half_log_det(equations, point)
     if half_log_det is None:
         return -np.inf, x
-    return _log_whitening(problem, frozen) - point.cost - half_log_det, x
+    return _log_whitening(problem, used) + log_outliers - point.cost - half_log_det, x
 
 
-def _pairs(after: Frozen, before: Frozen) -> list[tuple[FloatArray, FloatArray | None]]:
-    return [(a, b) for a, b in zip(after, before, strict=True) if a is not None]
+def _same(before: Frozen, after: Frozen) -> bool:
+    return all(
+        a is None or b is None or np.allclose(a, b, 1e-3, 0.0)
+        for a, b in zip(after, before, strict=True)
+    )
+
+
+def _normal(equations: NormalEquations) -> NormalEquations:
+    """The same equations without the robust loss; what is worked out already is kept."""
+    made = copy(equations)
+    made.problem = replace(equations.problem, loss=RobustLoss("none"))
+    return made
+
+
+def _without_outliers(problem: Problem, x: FloatArray, frozen: Frozen) -> tuple[Frozen, float]:
+    """Standard deviations that outliers have no part in, and the log likelihood of those.
+
+    The latter makes up for what their widened density would count.
+    """
+    used: list[FloatArray | None] = []
+    total = 0.0
+    for block, sigma in zip(problem.blocks, frozen, strict=True):
+        if sigma is None or not block.robust:
+            used.append(sigma)
+            continue
+        residual = block.evaluate(x, sigma, jacobian=False)[0][:, 0]
+        outlier = _outliers(residual, sigma)
+        used.append(np.where(outlier, IGNORED * sigma, sigma))
+        constant = np.log(OUTLIERS / (1.0 - OUTLIERS) * np.sqrt(2.0 * np.pi) / (2.0 * FARTHEST))
+        total += float((constant + np.log(IGNORED * sigma[outlier])).sum())
+    return tuple(used), total
+
+
+def _outliers(residual: FloatArray, sigma: FloatArray) -> BoolArray:
+    """Which whitened residuals are likelier as outliers, shape (M,)."""
+    normal = np.log((1.0 - OUTLIERS) / (np.sqrt(2.0 * np.pi) * sigma)) - 0.5 * residual**2
+    return normal < np.log(OUTLIERS / (2.0 * FARTHEST))
 
 
 def _minimum(equations: NormalEquations, x: FloatArray, frozen: Frozen) -> FloatArray:
@@ -100,21 +147,11 @@ def _half_log_det(equations: NormalEquations, point: Point) -> float | None:
 
 
 def _log_whitening(problem: Problem, frozen: Frozen) -> float:
-    """Sum over the rows of log det W, robust rows by their share."""
-    total, share = 0.0, robust_share(problem.loss)
+    """Sum over the rows of log det W."""
+    total = 0.0
     for block, held in zip(problem.blocks, frozen, strict=True):
         if isinstance(block, LinearBlock):
             total += 0.0 if block.log_det is None else block.log_det()
         elif held is not None:
-            total -= (share if block.robust else 1.0) * float(np.log(held).sum())
+            total -= float(np.log(held).sum())
     return total
-
-
-def robust_share(loss: RobustLoss) -> float:
-    """What a row of standard normal noise adds to the derivative of its cost by log sigma.
-
-    E[rho'(r) r], 1 for the quadratic loss: with it, the most likely sigma of normal noise is the
-    true one.
-    """
-    r, weight = np.polynomial.hermite_e.hermegauss(QUADRATURE)
-    return float(weight @ (loss.weights(r) * r * r) / weight.sum())
