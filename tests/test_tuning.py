@@ -22,7 +22,7 @@ from ubl_graph.cli import main
 from ubl_graph.io.result_files import summary
 from ubl_graph.options import AUTOMATIC
 from ubl_graph.sim import Sea, demo_survey, pressure, sampled, straight_pass, two_way_pings, wander
-from ubl_graph.sim.xue2024 import xue2024_mission
+from ubl_graph.sim.xue2024 import xue_pass
 
 EVERYTHING = {"motion": "auto", "acceleration_psd": "auto", "jerk_psd": "auto"}
 #: Pings of Xue's missions that count: the ends know only one side.
@@ -143,7 +143,7 @@ def test_no_noise_is_a_legal_answer():
     [(track, s) for track in ("straight", "accelerating", "spiral") for s in (1e-4, 1.15e-3)],
 )
 def test_close_to_the_best_in_hindsight(track, sigma):
-    mission, _ = xue2024_mission(track, seed=5, sigma=sigma)
+    mission, _ = xue_pass(track, seed=5, sigma=sigma)
     chosen = rmse(smoothed(mission, **EVERYTHING), INNER)
     tried = [
         rmse(smoothed(mission, motion=motion, **{name: q, f"vertical_{name}": q}), INNER)
@@ -169,6 +169,25 @@ def test_covariances_are_true_under_its_own_noise():
         nees += list(np.einsum("mi,mij,mj->m", error, np.linalg.inv(states.covariance), error))
     assert 0.9 < np.sqrt(np.mean(squares)) < 1.1
     assert np.mean(nees) == pytest.approx(3.0, rel=0.2)
+
+
+@pytest.mark.parametrize("track", ["straight", "accelerating"])
+def test_the_chosen_numbers_work_online(track):
+    mission, truth = xue_pass(track, seed=5)
+    chosen = smoothed(mission, **EVERYTHING).mission
+    assert chosen.options.horizontal_psd < 1e-9
+    estimator = FixedLagEstimator.of(chosen)
+    (segment,) = chosen.segments
+    errors = []
+    for i in range(101):
+        ping = segment.two_way_range[i : i + 1]
+        estimator.add(segment.depth[i : i + 1])
+        estimator.add(ping)
+        estimate = estimator.estimate(float(ping.t_receive[0]))
+        if estimate.t > 200.0:
+            assert estimate.status == "ok", (estimate.t, estimate.reasons)
+            errors.append(np.hypot(*(estimate.position - truth.position(estimate.t)[0])[:2]))
+    assert np.sqrt(np.mean(np.square(errors))) < 0.4
 
 
 # -- what goes with it --
@@ -215,6 +234,56 @@ def test_what_does_not_apply_keeps_its_default():
     result = smoothed(mission, jerk_psd="auto")
     assert result.tuning.chosen == {}
     assert result.mission.options.jerk_psd == Options().jerk_psd
+
+
+def test_a_motion_prior_is_not_judged_where_odometry_joins_nodes():
+    mission, _ = demo_survey(seed=1)
+    result = smoothed(mission, **EVERYTHING)
+    assert result.tuning.chosen == {}
+    assert result.mission.options == Options()
+    (said,) = [w for w in result.warnings if "auto" in w]
+    assert said.startswith("motion, acceleration_psd, jerk_psd")
+
+
+def test_a_gap_in_the_odometry_is_bridged():
+    mission, _ = demo_survey(seed=1)
+    (segment,) = mission.segments
+    heard = (segment.velocity.t < 300.0) | (segment.velocity.t > 500.0)
+    deaf = replace(mission, segments=(replace(segment, velocity=segment.velocity[heard]),))
+    result = smoothed(deaf, acceleration_psd="auto")
+    assert result.status == "converged"
+    assert np.diff(result.trajectory.t).max() <= 10.0 + 1e-9
+    assert rmse(result) < 1.5 * rmse(smooth(deaf))
+
+
+def test_what_was_stated_and_what_is_in_force():
+    mission, _ = wandering(1, 1e-3, sigma=1e-4, stated=1e-3)
+    result = smoothed(mission, travel_time_sigma="auto", acceleration_psd=1e-3)
+    factor = result.tuning.travel_time_factor
+    assert 0.05 < factor < 0.25
+    assert result.tuning.chosen["travel_time_sigma"] == pytest.approx(1e-3 * factor)
+
+
+def test_too_few_data_keep_the_defaults():
+    mission, _ = straight_pass(seed=1)
+    (segment,) = mission.segments
+    few = replace(mission, segments=(replace(segment, two_way_range=segment.two_way_range[:8]),))
+    result = smoothed(few, acceleration_psd="auto")
+    assert result.tuning.chosen == {}
+    assert "8 ranges and fixes are too few for 2 numbers" in result.tuning.trouble
+
+
+def test_a_third_of_outliers():
+    mission, _ = wandering(4, 1e-3, sigma=1e-4)
+    (segment,) = mission.segments
+    pings = segment.two_way_range
+    rng = np.random.default_rng(4)
+    late = (rng.random(len(pings)) < 0.3) * rng.uniform(2e-3, 2e-2, len(pings))
+    pings = replace(pings, t_receive=pings.t_receive + late, travel_time=pings.travel_time + late)
+    spoiled = replace(mission, segments=(replace(segment, two_way_range=pings),))
+    result = smoothed(spoiled, acceleration_psd="auto", travel_time_sigma="auto", loss="cauchy")
+    assert result.tuning.travel_time_factor < 3.0
+    assert result.tuning.chosen["acceleration_psd"] < 0.05
 
 
 def test_data_that_leave_the_track_open_keep_the_defaults():
@@ -324,6 +393,28 @@ def test_the_command_says_what_was_chosen(folder, monkeypatch, capsys):
         "chosen by the data: motion constant_velocity, acceleration_psd" in capsys.readouterr().out
     )
     assert json.loads((folder / "out" / "result.json").read_text())["tuning"]["trouble"] == ""
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        (
+            'acceleration_psd = "Auto"',
+            "'options.acceleration_psd': 'Auto' is not a number or 'auto'",
+        ),
+        ("acceleration_psd = true", "'options.acceleration_psd': True is not a number or 'auto'"),
+        ('motion = "constant"', "'options.motion': 'constant' is not allowed"),
+        ('speed_sigma = "auto"', "'options.speed_sigma': 'auto' is not a number"),
+    ],
+)
+def test_a_mission_files_errors_name_the_option(folder, line, says):
+    path = folder / "dive.toml"
+    text = path.read_text()
+    begin, end = text.index("[options]"), text.index("[data]")
+    path.write_text(text[:begin] + f"[options]\n{line}\n" + text[end:])
+    with pytest.raises(ConfigurationError) as caught:
+        load_mission(path)
+    assert says in str(caught.value)
 
 
 @pytest.mark.parametrize("command", ["smooth", "live"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from ubl_graph.errors import DataError
 from ubl_graph.factors.odometry import Preintegration
 from ubl_graph.mission import Segment
 from ubl_graph.options import Options
-from ubl_graph.trajectory import Order, longest_interval
+from ubl_graph.trajectory import Order, longest_interval, process_noise
 
 #: Speed that turns a travel time's sigma into metres for the spacing rule, m/s.
 NOMINAL_SPEED = 1500.0
@@ -31,6 +32,8 @@ SAME_INSTANT = 1e-6
 LEAST_SHARE: dict[Order, float] = {2: 0.03, 3: 0.1}
 
 
+#: What the motion noise moves a vehicle by between two nodes of a regular grid, at the least, m.
+LEAST_MOVE = 1e-6
 #: Spacings of regular grids, s: coarser ones would let a vehicle turn between two nodes.
 ROUND_SPACINGS = (0.1, 0.2, 0.25, 0.5, 1.0)
 
@@ -67,7 +70,8 @@ def node_times(
         nearer = kept - wanted[before] < wanted[after] - kept
         stay[np.where(nearer, before, after)] = True
     least = LEAST_SHARE[order] * spacing
-    longest = max(LONGEST_GAP, least, _shared_spacing(order, spacing, segment))
+    # Odometry interpolates nothing: between its nodes the vehicle may do as it likes.
+    longest = LONGEST_GAP if odometry else max(LONGEST_GAP, _longest_gap(options, segment))
     return _filled(_thinned(wanted, stay, min(spacing, longest), least), longest)
 
 
@@ -110,6 +114,23 @@ def grid_spacing(options: Options) -> float:
     sigma = INTERPOLATION_SHARE * options.number("travel_time_sigma") * NOMINAL_SPEED / 2.0
     longest = longest_interval(order_of(options), options.horizontal_psd, sigma)
     return max((s for s in ROUND_SPACINGS if s <= longest), default=ROUND_SPACINGS[0])
+
+
+def grid_options(options: Options) -> Options:
+    """Options with the motion noise that a regular grid needs, and no less.
+
+    Neighbouring nodes that know each other's place to less than `LEAST_MOVE` leave double precision
+    no digits for where both are. Over a lag of 80 s with a node a second it lets the vehicle move
+    by 1 mm (WNOA) or 6 cm (WNOJ).
+    """
+    order = order_of(options)
+    least = LEAST_MOVE**2 / float(process_noise(order, grid_spacing(options))[0, 0, 0])
+    name = ("acceleration_psd", "jerk_psd")[order - 2]
+    horizontal, vertical = options.horizontal_psd, options.vertical_psd
+    if min(horizontal, vertical) >= least:
+        return options
+    psd = {name: max(horizontal, least), f"vertical_{name}": max(vertical, least)}
+    return replace(options, **psd)
 
 
 def _check_span(times: FloatArray) -> None:
@@ -168,19 +189,56 @@ def _thinned(times: FloatArray, must_stay: BoolArray, spacing: float, least: flo
     return np.array([*chosen, times[-1]])
 
 
-def _shared_spacing(order: Order, spacing: float, segment: Segment) -> float:
-    """What `spacing` (s) shrinks to where several pings share an interval, and its error.
+def _longest_gap(options: Options, segment: Segment) -> float:
+    """How far apart nodes may stand where nothing asks for one, s.
 
-    The interpolation's variance grows with the interval to the third or fifth power (WNOA, WNOJ),
-    and as the pings in it have that error in common it must stay under the noise of their mean.
+    What lies between two nodes is interpolated, positions by the motion prior, slow states
+    linearly. The errors stay under a share of each record's noise, and as the records of an
+    interval have them in common, under that share of the noise of their mean.
     """
-    ranges = [r for r in (segment.two_way_range, segment.one_way_range) if r is not None]
-    times = np.concatenate([r.t_receive for r in ranges]) if ranges else np.empty(0)
-    span = float(np.ptp(times)) if len(times) else 0.0
-    if span * spacing == 0.0:
-        return spacing
-    power = 2 * order - 1
-    return min(spacing, (spacing**power * span / len(times)) ** (1.0 / (power + 1)))
+    order, gaps = order_of(options), [np.inf]
+    horizontal, vertical = options.horizontal_psd, options.vertical_psd
+    larger = max(horizontal, vertical)
+    two_way, one_way = segment.two_way_range, segment.one_way_range
+    for rows, way in ((two_way, NOMINAL_SPEED / 2.0), (one_way, NOMINAL_SPEED)):
+        if rows is not None and len(rows):
+            error = INTERPOLATION_SHARE * float(rows.sigma.min())
+            gaps.append(
+                _shared(longest_interval(order, larger, way * error), order, rows.t_receive)
+            )
+            if options.estimate_sound_speed:
+                flight = float(np.abs(rows.travel_time).max())
+                walk = options.number("sound_speed_walk") * flight
+                gaps.append(_shared(_longest_walk(walk, error), 1, rows.t_receive))
+    if one_way is not None and len(one_way):
+        error = INTERPOLATION_SHARE * float(one_way.sigma.min())
+        drift = max(options.clock_drift_walk, 1e-30) ** 2
+        gaps.append(_shared(_longest_walk(options.clock_walk, error), 1, one_way.t_receive))
+        gaps.append(_shared(longest_interval(2, drift, error), 2, one_way.t_receive))
+    if segment.position is not None and len(segment.position):
+        error = INTERPOLATION_SHARE * float(np.sqrt(segment.position.covariances[:, 0, 0].min()))
+        gaps.append(_shared(longest_interval(order, larger, error), order, segment.position.t))
+    if segment.depth is not None and len(segment.depth):
+        error = INTERPOLATION_SHARE * float(segment.depth.sigma.min())
+        gaps.append(_shared(longest_interval(order, vertical, error), order, segment.depth.t))
+    return min(gaps)
+
+
+def _longest_walk(walk: float, error: float) -> float:
+    """Interval over which linear interpolation of a random walk is off by `error`, s."""
+    return 4.0 * (error / max(walk, 1e-30)) ** 2
+
+
+def _shared(alone: float, order: int, times: FloatArray) -> float:
+    """What an interval (s) that is right for a single record shrinks to for records at `times`.
+
+    The error's variance grows with the interval to the power of 2 order - 1, the number of records
+    that have it in common with the interval itself.
+    """
+    span, power = float(np.ptp(times)), 2 * order - 1
+    if span == 0.0:
+        return alone
+    return min(alone, (alone**power * span / len(times)) ** (1.0 / (power + 1)))
 
 
 def _filled(times: FloatArray, longest: float) -> FloatArray:

@@ -108,8 +108,10 @@ def _tune(work: _Work) -> Tuning | None:
     with work.stage("noise"):
         work.mission, tuning = tuned(work.mission, lambda share: work.tell("noise", share))
     work.reset()
-    if tuning.trouble:
-        work.warn("", f"{', '.join(automatic)}: the defaults stand; {tuning.trouble}")
+    left = [name for name in automatic if name not in tuning.chosen]
+    if left:
+        why = tuning.trouble or "it does not apply, or nothing in the data speaks for a number"
+        work.warn("", f'{", ".join(left)} = "auto": the default stands; {why}')
     return tuning
 
 

@@ -1,9 +1,8 @@
 """Noise chosen by the data: what "auto" means in the options.
 
 The data are the more likely the better the noise describes them. Too little motion noise and the
-pings contradict the track, too much and they could have been anything: `log_evidence` weighs both.
-Each number is searched on a logarithmic scale, one after the other, until none of them makes the
-data more likely. No reference track is looked at, and no covariance.
+pings contradict the track, too much and they could have been anything: the marginal likelihood
+weighs both, and `noise_search` finds where it is largest.
 
 It knows no better than the model: what the model leaves out (horizontal gradients of the sound
 speed, say, which look like smooth motion) makes the likeliest noise too small, and covariances with
@@ -12,53 +11,17 @@ it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from ubl_graph.errors import SolverError
-from ubl_graph.factors import linear
-from ubl_graph.graph import SegmentModel, build_problem, model_segment
-from ubl_graph.initial import START_LIMIT, find_starts
-from ubl_graph.measurements import OneWayRange, TwoWayRange
-from ubl_graph.mission import Mission, Segment
-from ubl_graph.nodes import NOMINAL_SPEED, node_times
-from ubl_graph.options import AUTO, Motion, Options
-from ubl_graph.problem import Problem
-from ubl_graph.solve.evidence import log_evidence
-from ubl_graph.track import Track, carried, start_vector
+from ubl_graph.mission import Mission
+from ubl_graph.noise_search import NoiseSearch, Progress
+from ubl_graph.options import AUTO, Motion
 
-#: The first acceleration of a vehicle under water is zero within this, m/s^2. The smoother takes
-#: next to nothing for known; a likelihood would hold that against the model that has one.
-FIRST_ACCELERATION = 0.1
-#: Motion noise that moves a vehicle in all its mission by less than this share of what all pings
-#: together could see is none.
-NO_MOTION = 0.05
-#: Largest noise densities, m^2/s^3 and m^2/s^5: those of a vehicle that does as it likes.
-MOST_NOISE: dict[Motion, float] = {"constant_velocity": 1.0, "constant_acceleration": 1.0}
-#: Vertical noise is at least this share of the horizontal one, and the other way round: a
-#: thousandth of its motion. Nodes stand where the larger one wants them, so close that far less of
-#: the other would be lost in rounding.
-LEAST_SHARE = 1e-6
-#: Least noise densities where nodes stand close, for odometry joins others of them.
-LEAST_NOISE: dict[Motion, float] = {"constant_velocity": 1e-6, "constant_acceleration": 1e-8}
-#: Factors on the travel times' sigmas, and random walks of the sound speed, 1/sqrt(s).
-FACTORS, WALKS = (0.03, 100.0), (1e-8, 1e-3)
-#: Stands for the infinite cost of noise under which nothing can be solved.
-IMPOSSIBLE = 1e12
-#: What a stated sigma of the travel times is worth, in decades: right within a factor of three.
-STATED_SPREAD = 0.5
-#: Numbers are found to this share of a decade,
-TOLERANCE = 0.1
-#: and all of them are gone through until a pass makes the data less than so much more likely,
-WORTH_A_PASS = 0.1
-#: at most so often, the later ones in steps smaller by this.
-MOST_PASSES, LATER_STEPS = 4, 0.3
-
-#: Called with how far the search is, 0 to 1.
-Progress = Callable[[float], None]
+#: Both motion priors.
+MOTIONS: tuple[Motion, ...] = ("constant_velocity", "constant_acceleration")
 
 
 @dataclass(frozen=True)
@@ -106,28 +69,36 @@ def tuned(mission: Mission, progress: Progress | None = None) -> tuple[Mission, 
     """
     asked = mission.options
     settled = replace(mission, options=asked.settled)
-    motions: list[Motion] = ["constant_velocity", "constant_acceleration"]
+    motions = MOTIONS
     if asked.motion != AUTO:
-        motions = [asked.motion]
-    found: dict[Motion, _Search] = {}
-    try:
-        for number, motion in enumerate(motions):
-            search = _Search(settled, asked, motion)
+        motions = (asked.motion,)
+    elif _has_odometry(mission):
+        # Where odometry joins nodes there is no motion prior to judge.
+        motions = MOTIONS[:1]
+    found: dict[Motion, NoiseSearch] = {}
+    trouble = ""
+    for number, motion in enumerate(motions):
+        try:
+            search = NoiseSearch(settled, asked, motion)
             search.run(_part(progress, number, len(motions)))
+        except SolverError as error:
+            trouble = str(error)
+            continue
+        if np.isfinite(search.best):
             found[motion] = search
-    except SolverError as error:
-        return settled, Tuning({}, 1.0, {}, 0, str(error))
-    best = max(found.values(), key=lambda s: s.best)
-    if not np.isfinite(best.best):
-        trouble = "the data do not determine the track, whatever the noise"
+    if not found:
+        trouble = trouble or "the data do not determine the track, whatever the noise"
         return settled, Tuning({}, 1.0, {}, 0, trouble)
+    best = max(found.values(), key=lambda s: s.best)
+    if best.scarce:
+        return settled, Tuning({}, 1.0, {}, 0, best.scarce)
     out = best.answer()
     chosen: dict[str, float | str] = {
         name: getattr(out.options, name)
         for name in (*asked.automatic, *best.vertical)
         if name in best.names
     }
-    if asked.motion == AUTO:
+    if len(motions) > 1:
         chosen = {"motion": best.motion, **chosen}
     tuning = Tuning(
         chosen,
@@ -146,245 +117,5 @@ def _part(progress: Progress | None, number: int, count: int) -> Progress:
     return report
 
 
-@dataclass(frozen=True)
-class _Knob:
-    """A number that is searched: decadic logarithms of where to begin, of the bounds, of a step."""
-
-    start: float
-    low: float
-    high: float
-    step: float
-
-
-class _Search:
-    """The search for one motion prior.
-
-    Parameters
-    ----------
-    mission : Mission
-        With defaults in place of what is left to the data.
-    asked : Options
-        As the user gave them.
-    motion : str
-        The motion prior.
-
-    Attributes
-    ----------
-    best : float
-        Largest logarithm of the likelihood so far.
-    at : dict of str to float
-        Decadic logarithms of the numbers there, by option; of the travel times' sigmas that of
-        their factor.
-    evaluations : int
-        So far.
-    """
-
-    def __init__(self, mission: Mission, asked: Options, motion: Motion) -> None:
-        self.motion: Motion = motion
-        options = replace(mission.options, motion=motion)
-        self._mission = replace(mission, options=options)
-        self._models, tracks = _modelled(self._mission)
-        self._odometry = any(m.bottom or m.water for m in self._models)
-        constant_velocity = motion == "constant_velocity"
-        self._horizontal = "acceleration_psd" if constant_velocity else "jerk_psd"
-        self._vertical = f"vertical_{self._horizontal}"
-        self._knobs = self._all_knobs(asked)
-        self.at = {name: knob.start for name, knob in self._knobs.items()}
-        self.evaluations = 0
-        problem = self._problem(self.at)[1]
-        self._x, self._layout = start_vector(self._mission, problem.layout, tracks), problem.layout
-        self.best = -np.inf
-        self.best = self._evaluate(self.at)
-
-    @property
-    def names(self) -> frozenset[str]:
-        """Options that were searched."""
-        return frozenset(self._knobs)
-
-    @property
-    def vertical(self) -> tuple[str, ...]:
-        """The vertical noise density, where it was searched."""
-        return (self._vertical,) if self._vertical in self._knobs else ()
-
-    def run(self, progress: Progress) -> None:
-        """Go through all numbers until none makes the data more likely."""
-        passes = MOST_PASSES if len(self._knobs) > 1 else 1
-        for number in range(passes):
-            before = self.best
-            for k, (name, knob) in enumerate(self._knobs.items()):
-                progress((number + k / len(self._knobs)) / passes)
-                self._line(name, knob, knob.step if number == 0 else LATER_STEPS * knob.step)
-            if self.best - before < WORTH_A_PASS:
-                break
-
-    def answer(self) -> Mission:
-        """The mission with the numbers that are the best."""
-        return self._posed(self.at)
-
-    @property
-    def factor(self) -> float:
-        """On the travel times' sigmas."""
-        return 10.0 ** self.at.get("travel_time_sigma", 0.0)
-
-    def _posed(self, at: dict[str, float]) -> Mission:
-        """The mission with these numbers."""
-        values = {name: 10.0**u for name, u in at.items()}
-        factor = values.pop("travel_time_sigma", 1.0)
-        for one, other in ((self._horizontal, self._vertical), (self._vertical, self._horizontal)):
-            if one in values:
-                beside = values.get(other) or getattr(self._mission.options, other) or 0.0
-                values[one] = max(values[one], LEAST_SHARE * beside)
-        options = replace(self._mission.options, **values)
-        if factor != 1.0:
-            sigma = factor * options.number("travel_time_sigma")
-            options = replace(options, travel_time_sigma=sigma)
-        segments = tuple(_scaled(s, factor) for s in self._mission.segments)
-        return replace(self._mission, options=options, segments=segments)
-
-    def _all_knobs(self, asked: Options) -> dict[str, _Knob]:
-        options, free = self._mission.options, not _joined(self._models)
-        knobs: dict[str, _Knob] = {}
-
-        def add(name: str, start: float, low: float, high: float, step: float) -> None:
-            begin, least, most = (float(np.log10(x)) for x in (start, low, high))
-            knobs[name] = _Knob(min(max(begin, least), most), least, most, step)
-
-        if getattr(asked, self._horizontal) == AUTO and free:
-            low = self._least_noise()
-            add(self._horizontal, options.horizontal_psd, low, MOST_NOISE[self.motion], 1.0)
-            if getattr(asked, self._vertical) is None:
-                add(self._vertical, options.horizontal_psd, low, MOST_NOISE[self.motion], 1.0)
-        ranges = [r for m in self._models for r in _ranges(m.segment)]
-        if asked.travel_time_sigma == AUTO and ranges:
-            add("travel_time_sigma", 1.0, *FACTORS, 0.3)
-        if asked.sound_speed_walk == AUTO and ranges and options.estimate_sound_speed:
-            add("sound_speed_walk", options.number("sound_speed_walk"), *WALKS, 0.7)
-        return knobs
-
-    def _least_noise(self) -> float:
-        """Noise density that is as good as none, m^2/s^3 or m^2/s^5."""
-        if self._odometry or self._mission.options.node_spacing is not None:
-            return LEAST_NOISE[self.motion]
-        least = MOST_NOISE[self.motion]
-        for model in self._models:
-            rows = _ranges(model.segment)
-            count = sum(len(r) for r in rows) + 1
-            seen = [float(np.median(r.sigma)) * NOMINAL_SPEED / 2.0 for r in rows] or [1.0]
-            moved = NO_MOTION * min(seen) / np.sqrt(count)
-            span = max(float(model.t[-1] - model.t[0]), 1.0)
-            power, factor = (3, 3.0) if self.motion == "constant_velocity" else (5, 20.0)
-            least = min(least, factor * moved**2 / span**power)
-        return least
-
-    def _line(self, name: str, knob: _Knob, step: float) -> None:
-        """Search one number, the others held: bracket the best value in steps, then narrow down."""
-        first = step
-        tried = {self.at[name]: self.best}
-
-        def value(u: float) -> float:
-            u = float(np.clip(u, knob.low, knob.high))
-            if u not in tried:
-                tried[u] = self._evaluate({**self.at, name: u})
-            return tried[u]
-
-        middle = self.at[name]
-        for sign in (-1.0, 1.0):
-            step = first
-            while value(middle + sign * step) > tried[middle]:
-                middle = float(np.clip(middle + sign * step, knob.low, knob.high))
-                step *= 1.5
-                if middle in (knob.low, knob.high):
-                    break
-        points = sorted(tried)
-        i = points.index(middle)
-        low, high = points[max(i - 1, 0)], points[min(i + 1, len(points) - 1)]
-
-        def cost(u: float) -> float:
-            return min(-value(u), IMPOSSIBLE)
-
-        if high - low > TOLERANCE:
-            minimize_scalar(
-                cost, bounds=(low, high), method="bounded", options={"xatol": TOLERANCE}
-            )
-
-    def _problem(self, at: dict[str, float]) -> tuple[Mission, Problem]:
-        mission = self._posed(at)
-        models = [
-            self._remodelled(model, segment, mission.options)
-            for model, segment in zip(self._models, mission.segments, strict=True)
-        ]
-        problem = build_problem(mission, models)
-        blocks = tuple(
-            linear.prior("acceleration", b.columns, 0.0 * b.target, np.array(FIRST_ACCELERATION))
-            if isinstance(b, linear.LinearBlock) and b.name == "acceleration prior"
-            else b
-            for b in problem.blocks
-        )
-        return mission, replace(problem, blocks=blocks)
-
-    def _remodelled(self, model: SegmentModel, segment: Segment, options: Options) -> SegmentModel:
-        """The segment with its new sigmas, and nodes where the new noise wants them."""
-        segment = replace(segment, start=model.segment.start)
-        if self._odometry or options.node_spacing is not None:
-            return replace(model, segment=segment)
-        return replace(model, segment=segment, t=node_times(segment, options))
-
-    def _evaluate(self, at: dict[str, float]) -> float:
-        """Logarithm of the likelihood; the best so far is kept."""
-        self.evaluations += 1
-        problem = self._problem(at)[1]
-        x = carried(self._layout, self._x, problem.layout)
-        try:
-            value, x = log_evidence(problem, x)
-        except SolverError:
-            if not np.isfinite(self.best):
-                raise
-            return -np.inf
-        value -= 0.5 * (at.get("travel_time_sigma", 0.0) / STATED_SPREAD) ** 2
-        if value > self.best:
-            self.best, self.at, self._x, self._layout = value, at, x, problem.layout
-        return value
-
-
-def _modelled(mission: Mission) -> tuple[list[SegmentModel], list[Track]]:
-    """All segments' models and starts; a start prior that the ranges contradict is left out."""
-    models: list[SegmentModel] = []
-    tracks: list[Track] = []
-    for segment in mission.segments:
-        model = model_segment(segment, mission.options)
-        starts = find_starts(mission, model)
-        if starts.start_sigmas is not None and starts.start_sigmas >= START_LIMIT:
-            model = replace(model, segment=replace(segment, start=None))
-            starts = find_starts(mission, model)
-        models.append(model)
-        tracks.append(starts.tracks[0])
-    return models, tracks
-
-
-def _joined(models: Sequence[SegmentModel]) -> bool:
-    """Whether odometry joins all nodes: then the motion prior has nothing to say."""
-    for model in models:
-        covered = np.zeros(len(model.t) - 1, dtype=np.bool_)
-        for samples in (model.bottom, model.water):
-            if samples is not None:
-                covered |= samples.between(model.t[:-1], model.t[1:]).covered
-        if not covered.all():
-            return False
-    return True
-
-
-def _ranges(segment: Segment) -> list[TwoWayRange | OneWayRange]:
-    both = (segment.two_way_range, segment.one_way_range)
-    return [rows for rows in both if rows is not None and len(rows)]
-
-
-def _scaled(segment: Segment, factor: float) -> Segment:
-    """The segment with its travel times' sigmas multiplied."""
-    if factor == 1.0:
-        return segment
-    two_way, one_way = segment.two_way_range, segment.one_way_range
-    return replace(
-        segment,
-        two_way_range=None if two_way is None else replace(two_way, sigma=factor * two_way.sigma),
-        one_way_range=None if one_way is None else replace(one_way, sigma=factor * one_way.sigma),
-    )
+def _has_odometry(mission: Mission) -> bool:
+    return any(s.velocity is not None and len(s.velocity) > 1 for s in mission.segments)

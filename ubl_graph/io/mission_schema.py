@@ -240,10 +240,16 @@ def _plain(
     detail = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
     kind, place, value = detail["type"], detail["loc"], detail["input"]
     remedy = ""
+    words_allowed: list[str] = []
+    if place[:1] == ("options",):
+        # Each kind that an option may have complains for itself, under a place of its own.
+        place = place[:2]
+        complaints = [d for d in details if d["loc"][:2] == place and d["type"] == "literal_error"]
+        words_allowed = [word for d in complaints for word in _literals(d)]
     if kind == "extra_forbidden":
         problem, remedy = _unknown_key(place, form)
     elif kind == "literal_error":
-        allowed = re.findall(r"'([^']*)'", detail.get("ctx", {}).get("expected", ""))
+        allowed = words_allowed or _literals(detail)
         problem, remedy = f"{shortened(value)} is not allowed", did_you_mean(str(value), allowed)
     elif kind == "value_error":
         problem = detail["msg"].removeprefix("Value error, ")
@@ -252,6 +258,7 @@ def _plain(
     else:
         words = _WORDS.get(kind)
         problem = words.format(value=shortened(value)) if words else detail["msg"]
+        problem += "".join(f" or '{word}'" for word in words_allowed)
     return ConfigurationError(
         " ".join(problem.split()),
         remedy,
@@ -259,6 +266,11 @@ def _plain(
         record=_beacon_label(place, content),
         field=".".join(part for part in place if isinstance(part, str)),
     )
+
+
+def _literals(detail: Any) -> list[str]:
+    """The words that one of pydantic's complaints would have allowed."""
+    return re.findall(r"'([^']*)'", detail.get("ctx", {}).get("expected", ""))
 
 
 def _unknown_key(place: tuple[int | str, ...], form: str) -> tuple[str, str]:

@@ -20,6 +20,7 @@ from ubl_graph.errors import DataError, TimeError
 from ubl_graph.frames import GeodeticOrigin
 from ubl_graph.measurements import OneWayRange, TwoWayRange, Velocity
 from ubl_graph.mission import Mission, Setup, Start, Vehicle
+from ubl_graph.nodes import grid_options
 from ubl_graph.online.buffer import entry_of
 from ubl_graph.online.core import FARTHEST, Core
 from ubl_graph.online.health import judge, sensor_report
@@ -94,7 +95,7 @@ class FixedLagEstimator:
     def _begin(self, setup: Setup) -> None:
         setup.options.require_settled()
         self.setup = setup
-        self.core = Core(setup)
+        self.core = Core(_workable(setup))
 
     # -- in --
 
@@ -159,7 +160,7 @@ class FixedLagEstimator:
     def reset(self) -> None:
         """Forget all records and the position; begin anew. Output stamps go on increasing."""
         last, resets, latency = self.core.state.last_output, self.core.resets, self.core.latency
-        self.core = Core(self.setup)
+        self.core = Core(_workable(self.setup))
         self.core.state.last_output, self.core.resets = last, resets + 1
         self.core.latency = latency
 
@@ -224,7 +225,10 @@ class FixedLagEstimator:
         if not self.core.state.located:
             raise TimeError("there is no position yet")
         self.core.refresh()
-        return self.core.tracker.trajectory()
+        found: Trajectory | None = self.core.guarded(self.core.tracker.trajectory)
+        if found is None:
+            raise TimeError("there is no position any more: the window's solver failed twice")
+        return found
 
     def health(self) -> dict[str, Any]:
         """Status, counts by sensor and reason, window and timing, ready for JSON."""
@@ -310,3 +314,8 @@ class FixedLagEstimator:
                 f"nothing is predicted farther than {FARTHEST:g} s ahead"
             )
         return t if last is None or t > last else last + TICK
+
+
+def _workable(setup: Setup) -> Setup:
+    """The setup with no less motion noise than the nodes of the window can bear."""
+    return replace(setup, options=grid_options(setup.options))

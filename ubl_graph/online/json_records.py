@@ -218,7 +218,8 @@ def _beacon(content: dict[str, Any], setup: Setup) -> Beacon:
 
 def _two_way_range(content: dict[str, Any], setup: Setup) -> TwoWayRange:
     beacon = _beacon(content, setup)
-    values: dict[str, Any] = {"sigma": setup.options.number("travel_time_sigma"), **numbers_of(content)}
+    sigma = setup.options.number("travel_time_sigma")
+    values: dict[str, Any] = {"sigma": sigma, **numbers_of(content)}
     if "travel_time" in values:
         return TwoWayRange(beacon.name, **values)
     if beacon.turnaround is None:
@@ -232,7 +233,8 @@ def _two_way_range(content: dict[str, Any], setup: Setup) -> TwoWayRange:
 
 
 def _one_way_range(content: dict[str, Any], setup: Setup) -> OneWayRange:
-    values: dict[str, Any] = {"sigma": setup.options.number("travel_time_sigma"), **numbers_of(content)}
+    sigma = setup.options.number("travel_time_sigma")
+    values: dict[str, Any] = {"sigma": sigma, **numbers_of(content)}
     return OneWayRange(_beacon(content, setup).name, **values)
 
 

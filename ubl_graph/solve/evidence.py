@@ -36,8 +36,12 @@ AT_REST = 1e-3
 MOST_ITERATIONS = 40
 #: The interpolation's variance, and which pings are outliers, are taken anew so often.
 ROUNDS = 2
-#: Outliers are one ping in twenty, and lie within so many seconds of the truth on either side.
-OUTLIERS, FARTHEST = 0.05, 0.1
+#: Outliers are one ping in twenty, to begin with; their share is then what it is found to be.
+OUTLIERS = 0.05
+#: They lie within so many seconds of the truth on either side.
+FARTHEST = 0.1
+#: Rounds of telling outliers and their share.
+SHARE_ROUNDS = 5
 #: By so much an outlier's standard deviation is multiplied: it counts for nothing.
 IGNORED = 1e6
 
@@ -110,17 +114,25 @@ def _without_outliers(problem: Problem, x: FloatArray, frozen: Frozen) -> tuple[
             used.append(sigma)
             continue
         residual = block.evaluate(x, sigma, jacobian=False)[0][:, 0]
-        outlier = _outliers(residual, sigma)
+        outlier, share = _outliers(residual, sigma)
         used.append(np.where(outlier, IGNORED * sigma, sigma))
-        constant = np.log(OUTLIERS / (1.0 - OUTLIERS) * np.sqrt(2.0 * np.pi) / (2.0 * FARTHEST))
+        constant = np.log(share * np.sqrt(2.0 * np.pi) / (2.0 * FARTHEST))
         total += float((constant + np.log(IGNORED * sigma[outlier])).sum())
+        total += float((~outlier).sum() * np.log1p(-share))
     return tuple(used), total
 
 
-def _outliers(residual: FloatArray, sigma: FloatArray) -> BoolArray:
-    """Which whitened residuals are likelier as outliers, shape (M,)."""
-    normal = np.log((1.0 - OUTLIERS) / (np.sqrt(2.0 * np.pi) * sigma)) - 0.5 * residual**2
-    return normal < np.log(OUTLIERS / (2.0 * FARTHEST))
+def _outliers(residual: FloatArray, sigma: FloatArray) -> tuple[BoolArray, float]:
+    """Which whitened residuals (M,) are likelier as outliers, and the share of those.
+
+    None found counts as half a one, and they are at most half of all.
+    """
+    share, outlier = OUTLIERS, np.zeros(len(residual), dtype=np.bool_)
+    for _ in range(SHARE_ROUNDS):
+        normal = np.log((1.0 - share) / (np.sqrt(2.0 * np.pi) * sigma)) - 0.5 * residual**2
+        outlier = normal < np.log(share / (2.0 * FARTHEST))
+        share = min(max(float(outlier.sum()), 0.5) / len(residual), 0.5)
+    return outlier, share
 
 
 def _minimum(equations: NormalEquations, x: FloatArray, frozen: Frozen) -> FloatArray:
