@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from sphinx.application import Sphinx
@@ -14,16 +15,25 @@ copyright = author
 version = release = ubl_graph.__version__
 
 extensions = [
-    "myst_parser",
+    "myst_nb",  # brings myst_parser
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "sphinx.ext.mathjax",
 ]
-source_suffix = {".md": "markdown"}
-exclude_patterns = ["_build"]
+source_suffix = {".md": "myst-nb", ".py": "myst-nb"}
+exclude_patterns = ["_build", "conf.py"]
 
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
+
+# docs/notebooks/*.py are run by every build, which fails where one of them does.
+nb_custom_formats = {".py": ["jupytext.reads", {"fmt": "py:percent"}]}
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 300  # s a cell
+nb_merge_streams = True
+# What a cell writes as Markdown may hold formulas and tables.
+nb_render_markdown_format = "myst"
 
 # In the docstrings single backticks mark code.
 default_role = "code"
@@ -53,8 +63,16 @@ def _restore(_: Sphinx, what: str, name: str, __: object, ___: object, lines: li
         lines[:] = _TEXTS.pop(name)
 
 
+def _lengths(_: Sphinx, __: str, ___: str, ____: object, _____: object, lines: list[str]) -> None:
+    # |P - B| is a length in our docstrings, reStructuredText's substitution never.
+    for i, line in enumerate(lines):
+        if "`" not in line and not line.lstrip().startswith((">>>", "...")):
+            lines[i] = re.sub(r"\|([^|]+)\|", r"\\|\1\\|", line)
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Put our handlers before and after napoleon's, which has priority 500."""
     app.connect("autodoc-process-docstring", _keep, priority=400)
     app.connect("autodoc-process-docstring", _restore, priority=600)
+    app.connect("autodoc-process-docstring", _lengths, priority=700)
     return {"parallel_read_safe": False}

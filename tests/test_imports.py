@@ -32,6 +32,7 @@ ORDER = [
     "track",
     "initial",
     "solve/",
+    "noise_search",
     "tuning",
     "result",
     "assembly",
@@ -43,7 +44,10 @@ ORDER = [
     "plots",
     "io/",
     "online/",
+    "cluster",
+    "workers",
     "study",
+    "batch",
     "cli",
     "__main__",
 ]

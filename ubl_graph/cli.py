@@ -5,10 +5,11 @@ Bad input ends with one line on standard error and exit code 2; nothing is writt
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from rich.table import Table
 from ubl_graph.errors import UblGraphError
 
 if TYPE_CHECKING:
+    from ubl_graph.batch import BatchRow
     from ubl_graph.evaluation import Errors
     from ubl_graph.mission import Mission
     from ubl_graph.result import Result
@@ -111,6 +113,57 @@ def demo(
         rows["dead reckoning"] = errors_of(reckoned[segment.name], segment.reference)
         rows["smoothed"] = evaluate(result)[segment.name]
     _print_errors(rows)
+
+
+@app.command()
+def batch(
+    missions: Annotated[
+        list[Path], typer.Argument(metavar="MISSION.toml", help="The mission files.")
+    ],
+    output: Output,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Let the workers of this dask scheduler do it, e.g. tcp://10.0.0.5:8786.",
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(metavar="N", min=1, help="Processes; one per processor if left out."),
+    ] = None,
+    figures: Figures = True,
+    solver: SolverOption = None,
+) -> None:
+    """Smooth many missions the same way, side by side, and sum them up in one table.
+
+    Each mission gets a folder in DIR, named after its file; the table is printed and written to
+    DIR/batch.csv and DIR/batch.json. A mission that fails does not end the batch: it is named on
+    standard error, and the exit code is then 1.
+
+    Example: ubl-graph batch dives/*.toml -o dives-out
+    """
+    from ubl_graph.batch import smooth_batch, write_table
+    from ubl_graph.workers import executor_at
+
+    with executor_at(scheduler, workers=workers) as executor, _progress("batch") as report:
+        if scheduler is not None:
+            # What dask says of workers that come and go would tear the bar; what is lost with
+            # one ends in the table.
+            logging.getLogger("distributed").setLevel(logging.CRITICAL)
+        rows = smooth_batch(
+            missions, output, executor=executor, figures=figures, solver=solver, progress=report
+        )
+    for row in rows:
+        if row.failed:
+            _warn(row.error if row.file in row.error else f"{row.file}: {row.error}")
+        for warning in row.warnings:
+            typer.echo(f"warning: {row.folder}: {warning}", err=True)
+    write_table(rows, output)
+    typer.echo(f"written to {output}")
+    _print_batch(rows)
+    if any(row.failed for row in rows):
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -234,6 +287,8 @@ def _progress(name: str) -> Generator[Report]:
 
 def _print_segments(result: Result) -> None:
     typer.echo(f"status: {result.status}" + (f" ({result.reason})" if result.reason else ""))
+    if result.tuning is not None and result.tuning.chosen:
+        typer.echo("chosen by the data: " + ", ".join(_chosen(result.tuning.chosen)))
     for warning in result.warnings:
         typer.echo(f"warning: {warning}", err=True)
     table = _table("segment", "nodes", "pings", "down-weighted", "median sd, m", "status")
@@ -249,6 +304,32 @@ def _print_segments(result: Result) -> None:
             segment.status,
         )
     _show(table)
+
+
+def _chosen(values: dict[str, float | str]) -> list[str]:
+    return [f"{k} {v if isinstance(v, str) else format(v, '.2g')}" for k, v in values.items()]
+
+
+def _print_batch(rows: Sequence[BatchRow]) -> None:
+    table = _table(
+        *("mission", "segments", "pings", "down-weighted"),
+        *("median sd, m", "rmse, m", "time, s", "status"),
+    )
+    for row in rows:
+        table.add_row(
+            row.folder,
+            "-" if row.failed else str(row.segments),
+            "-" if row.failed else str(row.pings),
+            _number(row.down_weighted_share, "{:.1%}"),
+            _number(row.median_sd_m, "{:.2f}"),
+            _number(row.horizontal_rmse_m, "{:.2f}"),
+            f"{row.seconds:.1f}",
+            row.status,
+        )
+    _show(table)
+    for row in rows:
+        if row.reason:
+            typer.echo(f"{row.folder}: {row.status}: {row.reason}")
 
 
 def _print_errors(rows: dict[str, Errors]) -> None:

@@ -8,6 +8,7 @@
 [[-200.0, -40.0, -60.0], [-110.0, -10.0, -60.0]]
 """
 
+from ubl_graph.sim.cao2017 import SeaTrial, cao_pass, cao_sea_trial
 from ubl_graph.sim.missions import demo_survey, straight_pass
 from ubl_graph.sim.sensors import (
     Clock,
@@ -28,23 +29,31 @@ from ubl_graph.sim.tracks import (
     sampled,
     wander,
 )
+from ubl_graph.sim.xue2024 import munk_profile, xue_pass, xue_track, xue_wandering
 
 __all__ = [
     "Clock",
     "DvlErrors",
     "Sea",
+    "SeaTrial",
     "Truth",
     "ahrs",
+    "cao_pass",
+    "cao_sea_trial",
     "constant_acceleration",
     "constant_velocity",
     "demo_survey",
     "dvl",
     "fixes",
     "lawn_mower",
+    "munk_profile",
     "one_way_pings",
     "pressure",
     "sampled",
     "straight_pass",
     "two_way_pings",
     "wander",
+    "xue_pass",
+    "xue_track",
+    "xue_wandering",
 ]
