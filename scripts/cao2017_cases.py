@@ -144,6 +144,7 @@ class Passes:
             cao_pass(
                 seed,
                 north=north,
+                east=(WEST, max(self.east)),
                 dvl_error=ERRORS[self.error],
                 range_sigma=self.range_sigma,
                 start_sigma=self.start_sigma,

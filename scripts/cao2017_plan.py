@@ -96,25 +96,25 @@ def span(first: float, last: float, step: float) -> tuple[float, ...]:
 
 FULL = Plan(
     map_north=span(0.0, 3000.0, 100.0),
-    map_east=span(-3000.0, 3000.0, 100.0),
-    draw_north=span(0.0, 3000.0, 200.0),
+    map_east=span(-3000.0, 3000.0, 200.0),
+    draw_north=span(0.0, 3000.0, 300.0),
     draw_east=span(-2400.0, 3000.0, 600.0),
     draws=8,
     runs=30,
     pings=60,
-    stride=1,
-    passes=span(200.0, 3000.0, 200.0),
+    stride=2,
+    passes=span(200.0, 3000.0, 400.0),
 )
 QUICK = Plan(
-    map_north=(0.0, 100.0, 200.0, 300.0, 1000.0, 2000.0, 3000.0),
+    map_north=(0.0, 100.0, 200.0, 300.0, 1000.0, 3000.0),
     map_east=(-3000.0, -2000.0, 0.0, 2000.0, 3000.0),
     draw_north=(0.0, 400.0, 1400.0, 3000.0),
     draw_east=(-500.0, 3000.0),
-    draws=8,
-    runs=3,
+    draws=4,
+    runs=2,
     pings=60,
-    stride=4,
-    passes=(200.0, 1000.0, 2500.0),
+    stride=8,
+    passes=(200.0, 1000.0),
 )
 
 

@@ -27,7 +27,7 @@ TINY = plans.Plan(
     map_north=(0.0, 100.0, 3000.0),
     map_east=(-3000.0, 1000.0, 3000.0),
     draw_north=(0.0, 1000.0),
-    draw_east=(-500.0, 3000.0),
+    draw_east=(-1000.0, -500.0),
     draws=2,
     runs=1,
     pings=30,
@@ -196,7 +196,7 @@ def test_the_graph_sees_nothing_later_than_now():
     """Its position at a ping stays the same whatever comes after."""
     from cao2017_cases import newest
 
-    (mission, *_) = GraphPasses("forward", 5.0, 0.1, 1.0, ((300.0, 5),), ()).missions()
+    (mission, *_) = GraphPasses("forward", 5.0, 0.1, 1.0, ((300.0, 5),), (3000.0,)).missions()
     (segment,) = mission.segments
     later = segment.one_way_range.t_receive > segment.one_way_range.t_receive[200]
     pings = segment.one_way_range
