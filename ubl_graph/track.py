@@ -117,7 +117,9 @@ def mirror_images(mission: Mission, model: SegmentModel, track: Track) -> list[T
 
     Without odometry they fit as well, but for what is known of points, when reflected in a vertical
     plane through the beacon: along the mean course, or through the start where a prior holds that.
-    Windows find such images too, but on a valley of answers only by luck.
+    Odometry knows the heading, but not on which side of the beacon a straight track went by: there
+    the track is moved across its course to the other side. Windows find such images too, but on a
+    valley of answers only by luck.
 
     Parameters
     ----------
@@ -129,13 +131,15 @@ def mirror_images(mission: Mission, model: SegmentModel, track: Track) -> list[T
     Returns
     -------
     list of Track
-        Empty with odometry, with a second beacon, or without any.
+        Empty with a second beacon, or without any.
     """
     segment, name = model.segment, _lone_beacon(model)
     if name is None:
         return []
     beacon = next(b for b in mission.beacons if b.name == name).position[:2]
     axes = [track.position[-1, :2] - track.position[0, :2]]
+    if _has_odometry(model):
+        return [_beyond(track, beacon, axis) for axis in axes if np.linalg.norm(axis) > 1.0]
     if segment.start is not None:
         axes.append(np.array([segment.start.east, segment.start.north]) - beacon)
     return [_reflected(track, beacon, axis) for axis in axes if np.linalg.norm(axis) > 1.0]
@@ -148,7 +152,7 @@ def unanchored(model: SegmentModel) -> str | None:
     odometry, which knows the heading, one known point still leaves the mirror image; two do not.
     """
     segment = model.segment
-    if _lone_beacon(model) is None:
+    if _lone_beacon(model) is None or _has_odometry(model):
         return None
     fixes = 0 if segment.position is None else len(segment.position)
     anchors = fixes + (segment.start is not None)
@@ -164,13 +168,23 @@ def unanchored(model: SegmentModel) -> str | None:
 
 
 def _lone_beacon(model: SegmentModel) -> str | None:
-    """Name of the only beacon heard where there is no odometry, else None."""
+    """Name of the only beacon heard, None where there are others or none."""
     segment = model.segment
     ranges = [r for r in (segment.two_way_range, segment.one_way_range) if r is not None]
     heard = {str(name) for r in ranges for name in r.beacon}
-    if len(heard) != 1 or model.bottom is not None or model.water is not None:
-        return None
-    return heard.pop()
+    return heard.pop() if len(heard) == 1 else None
+
+
+def _has_odometry(model: SegmentModel) -> bool:
+    return model.bottom is not None or model.water is not None
+
+
+def _beyond(track: Track, point: FloatArray, axis: FloatArray) -> Track:
+    """Move a track across its course (east, north) to the other side of a point."""
+    across = np.array([-axis[1], axis[0]]) / np.linalg.norm(axis)
+    position = track.position.copy()
+    position[:, :2] -= 2.0 * float(((position[:, :2] - point) @ across).mean()) * across
+    return replace(track, position=position)
 
 
 def _reflected(track: Track, point: FloatArray, axis: FloatArray) -> Track:
