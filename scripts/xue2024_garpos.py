@@ -85,7 +85,8 @@ def compared(
                 [_distance(f.t, f.position, truths[s]) for s, f in fixes.items()]
             )
             rows += _rows(name, epoch, float(np.sqrt(np.nanmean(errors**2))), numbers[key])
-        dop = float(np.mean(np.concatenate([w.trdop for w in windows.values()])))
+        # Windows with too few pings for the model have no dilution.
+        dop = float(np.nanmean(np.concatenate([w.trdop for w in windows.values()])))
         rows.append(row("Table 5", name, "TRDOP", None, None, dop))
     rows += _whole(result, found, truths)
     return rows, _tracks(mission, found, result)

@@ -463,3 +463,26 @@ def test_without_a_start_the_graph_says_that_two_tracks_fit():
     result = smooth(mission)
     assert result.status == "unobservable"
     assert result.reason.startswith("ambiguous")
+
+
+@pytest.mark.parametrize("north", [30.0, 100.0, 400.0, 1500.0])
+def test_a_pass_without_a_start_is_ambiguous(north):
+    """Which side of the beacon it went by nothing tells: DVL and heading do not."""
+    mission, _ = cao_pass(1, north=north, range_sigma=0.1, start_sigma=None)
+    result = smooth(mission)
+    assert result.status == "unobservable"
+    assert result.reason.startswith("ambiguous: another track")
+
+
+def test_two_passes_without_a_start_are_ambiguous_each():
+    passes = [cao_pass(seed, north=150.0, range_sigma=0.1, start_sigma=None)[0] for seed in (1, 2)]
+    segments = [replace(m.segments[0], name=str(i)) for i, m in enumerate(passes)]
+    result = smooth(replace(passes[0], segments=tuple(segments)))
+    assert [s.reason[:9] for s in result.segments] == ["ambiguous", "ambiguous"]
+
+
+def test_a_start_that_the_dvl_does_not_reach_is_refused():
+    mission, _ = cao_pass(1, north=500.0)
+    start = Start(-5000.0, 0.0, 500.0, sigma=1.0)
+    with pytest.raises(DataError, match="does not cover the time from the start"):
+        cao2017(mission, {"": start})

@@ -76,6 +76,7 @@ def test_a_vehicle_at_rest_seen_before_and_after_has_position_and_velocity_apart
     [
         ("straight", 0, 1.5000, 1e-3),
         ("accelerating", 0, 1.5029, 1e-3),
+        ("spiral", 0, 1.4982, 5e-3),
         ("straight", 1, 0.7975, 0.01),
         ("accelerating", 1, 0.8006, 0.01),
         ("spiral", 1, 0.7867, 0.01),

@@ -18,13 +18,14 @@ from ubl_graph.assembly import assemble_segment, beacons_of, direction, shared_o
 from ubl_graph.errors import SolverError
 from ubl_graph.graph import SegmentModel, build_problem, model_segment
 from ubl_graph.initial import START_LIMIT, Starts, find_starts
+from ubl_graph.layout import Chain
 from ubl_graph.mission import Mission
 from ubl_graph.problem import Problem
 from ubl_graph.result import DOWN_WEIGHTED, Result, SegmentResult, Shared
 from ubl_graph.solve.choice import Choice, choose
 from ubl_graph.solve.marginals import Marginals
 from ubl_graph.solve.rounds import Engine, Solution, confirms, graduated, solve
-from ubl_graph.track import mirror_images, start_vector, track_of, unanchored
+from ubl_graph.track import mirror_images, place, start_vector, track_of, unanchored
 from ubl_graph.tuning import Tuning, tuned
 
 #: A second track counts as no worse where its cost is higher by less than this: odds of 20 to 1.
@@ -167,15 +168,16 @@ def _smooth_group(
         solution, rivals, solver = _solved(work, problem, group, [s for _, s in searched])
     with work.stage("covariance"):
         marginals = Marginals(problem, solution)
-        rival, track = _rival(problem, solution, marginals, rivals)
-        if len(group) == 1:
-            rival = unanchored(group[0]) or rival
-        results = [
-            assemble_segment(
-                problem, solution, marginals, chain, model, rival, track, number, solver
+        results: list[SegmentResult] = []
+        for chain, model in zip(problem.layout.chains, group, strict=True):
+            rival, track = _rival(problem, solution, marginals, rivals, chain)
+            if len(group) == 1:
+                rival = unanchored(model) or rival
+            results.append(
+                assemble_segment(
+                    problem, solution, marginals, chain, model, rival, track, number, solver
+                )
             )
-            for chain, model in zip(problem.layout.chains, group, strict=True)
-        ]
         return results, shared_of(problem, solution, marginals)
 
 
@@ -208,7 +210,7 @@ def _search(work: _Work, model: SegmentModel) -> tuple[SegmentModel, Starts]:
 def _solve_from(
     work: _Work, engine: Engine, group: Sequence[SegmentModel], starts: Sequence[Starts]
 ) -> tuple[Solution, list[Solution]]:
-    """Solve from the best start, and from its rivals and mirror images in a single segment.
+    """Solve from the best start, from the rivals of a single segment, and from mirror images.
 
     Returns the cheapest solution, and the others, cheapest first.
     """
@@ -218,13 +220,19 @@ def _solve_from(
     if _down_weighted(problem, solutions[0]) > DOUBTFUL_SHARE:
         solutions.append(work.solve(engine, graduated(engine, begin)))
         solutions.sort(key=lambda s: s.cost)
+    layout = problem.layout
+    starts_at: list[FloatArray] = []
     if len(group) == 1:
-        rivals = list(starts[0].tracks[1:])
-        if unanchored(group[0]) is None:
-            found = track_of(problem.layout, problem.layout.chains[0], solutions[0].x)
-            rivals += mirror_images(work.mission, group[0], found)
-        starts_at = [start_vector(work.mission, problem.layout, [track]) for track in rivals]
-        solutions += [work.solve(engine, x) for x in starts_at]
+        rivals = starts[0].tracks[1:]
+        starts_at += [start_vector(work.mission, layout, [track]) for track in rivals]
+    for chain, model in zip(layout.chains, group, strict=True):
+        if unanchored(model) is None:
+            found = track_of(layout, chain, solutions[0].x)
+            for image in mirror_images(work.mission, model, found):
+                x = solutions[0].x.copy()
+                place(layout, chain, image, x)
+                starts_at.append(x)
+    solutions += [work.solve(engine, x) for x in starts_at]
     # Mirror images cost the same but for rounding: of equals the first stays the answer.
     least = min(s.cost for s in solutions)
     best = next(s for s in solutions if s.cost <= least + SAME_COST)
@@ -260,16 +268,21 @@ def _down_weighted(problem: Problem, solution: Solution) -> float:
 
 
 def _rival(
-    problem: Problem, best: Solution, marginals: Marginals, others: Sequence[Solution]
+    problem: Problem,
+    best: Solution,
+    marginals: Marginals,
+    others: Sequence[Solution],
+    chain: Chain,
 ) -> tuple[str | None, FloatArray | None]:
-    """Another track that fits as well and that the covariance does not cover.
+    """Another track of a segment that fits as well and that the covariance does not cover.
 
     Returns what to say of it, and its positions at all nodes.
     """
-    sigma = np.sqrt(np.linalg.eigvalsh(marginals.of("position"))[:, -1])
+    sigma = np.sqrt(np.linalg.eigvalsh(marginals.of("position")[chain.nodes])[:, -1])
     covered = max(1.0, COVERED_SIGMAS * float(np.sqrt(np.mean(sigma**2))))
     for other in others:
-        gap = problem.layout.get(best.x, "position") - problem.layout.get(other.x, "position")
+        here, there = (problem.layout.get(s.x, "position")[chain.nodes] for s in (best, other))
+        gap = here - there
         apart = float(np.sqrt(np.mean(np.sum(gap**2, axis=1))))
         extra = max(other.cost - best.cost, 0.0)
         if apart > covered and extra < AMBIGUOUS_COST:

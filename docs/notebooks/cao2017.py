@@ -485,10 +485,11 @@ say(
     f"which is {3000.0 * 0.002:.0f} m at 3 km, whatever the start; the graph can set the start "
     f"against it, and 20 m are worth no more than that. With 1 m it is "
     f"{gain['right', 1.0][0]:.1f} times.\n"
-    "- **Against an answer that was given.** Begun at the truth and stopped after three trials, LM "
-    "on the axis does not leave it by more than "
-    f"{np.nanmax(maps['forward', 'LM, 3 trials'][GRID == 0.0]):.1f} m. No estimator that uses the "
-    "data does better, nor could one at sea."
+    "- **Against an answer that was given.** Under an error to the right, LM on the axis, begun at "
+    "the truth and stopped after three trials, does not leave it by more than "
+    f"{np.nanmax(maps['right', 'LM, 3 trials'][GRID == 0.0]):.2f} m. An estimator that is not told "
+    "the answer has to find it, and before the beacon is passed nothing on the axis tells left "
+    "from right."
 )
 
 # %% [markdown]

@@ -72,7 +72,7 @@ def aside(position, truth, t):
 # $$ L = c\,T = |P(t_s) - B| + |P(t_r) - B| , $$
 #
 # says something of two places: the one where the ping was sent and the one where the reply was
-# heard. $N$ pings are $N$ numbers and $6N$ unknowns, however many beacons there are. The easy way
+# heard. $N$ pings are $N$ numbers and $4N$ unknowns, however many beacons there are. The easy way
 # out is to let the vehicle stand still for as long as it takes to hear enough beacons, and to take
 # $L/2$ for its distance: *space intersection*.
 #
@@ -424,7 +424,7 @@ draw_errors("accelerating")
 # estimator holds 80 s, as the paper's windows do, and what is older is kept as a prior on the nodes
 # behind it ([the online estimator](../online.md)). One thing it owes to hindsight: its motion noise
 # is what the evidence chose above, from the whole mission (but no less than what moves a vehicle,
-# within the lag, by a twentieth of what the lag's pings can see).
+# within the lag, by a tenth of what the lag's pings can see).
 
 # %% tags=["hide-input"]
 LAG = 80.0
@@ -432,7 +432,7 @@ LAG = 80.0
 
 def online_options(options, sigma):
     """Options of the fixed-lag estimator."""
-    unseen = 0.05 * sigma * 750.0 / 3.0  # m: nine pings in a lag
+    unseen = 0.1 * sigma * 750.0 / 3.0  # m: nine pings in a lag
     if options.is_constant_velocity:
         least, name = 3.0 * unseen**2 / LAG**3, "acceleration_psd"
     else:
@@ -490,7 +490,8 @@ say(
 # ## Where the graph is not ahead, and why
 #
 # Three experiments take its advantages away one at a time: without memory, with a motion prior that
-# does not suit the vehicle, and with too little motion noise.
+# does not suit the vehicle, and with too little motion noise. Online too little noise is worse
+# still: the estimator's gates, which are there for outliers, then refuse good pings.
 
 
 # %% tags=["hide-input"]

@@ -274,7 +274,15 @@ class _Chain:
             raise UnobservableError(
                 f"{self.where} has no start; the first window has to begin somewhere"
             )
-        way = self.moved(np.array([start.t]), self.t[:1])[0]
+        begin = np.array([start.t])
+        first, last = np.minimum(begin, self.t[:1]), np.maximum(begin, self.t[:1])
+        if not self.samples.between(first, last).covered.all():
+            raise DataError(
+                f"{self.where}: the DVL does not cover the time from the start at {start.t:g} s to "
+                f"the first fix at {self.t[0]:g} s",
+                "give a start while the DVL is heard, or positions to begin at (seeds)",
+            )
+        way = self.moved(begin, self.t[:1])[0]
         return np.array([start.east, start.north]) + way
 
     def fixes(self, found: WindowSolutions) -> Fixes:

@@ -134,6 +134,8 @@ def window_dops(
 ) -> tuple[FloatArray, Dops]:
     """Dilutions of precision of a segment's windows of pings along a known or planned track.
 
+    They are taken at the polynomial of the window's order that fits the track there.
+
     Parameters
     ----------
     mission : Mission
@@ -170,12 +172,23 @@ def window_dops(
     rows = rows[np.argsort(rows.t_transmit, kind="stable")]
     times = np.stack([rows.t_transmit, rows.t_receive], axis=1)
     where = np.stack([b.position for b in mission.beacons])[mission.beacon_numbers(rows.beacon)]
-    offset = track(times.ravel()).reshape(*times.shape, 3) - where[:, None]
+    place = track(times.ravel()).reshape(*times.shape, 3)
     index = np.arange(len(rows) - pings + 1)[:, None] + np.arange(pings)
     epoch = 0.5 * (times[index[:, 0], 0] + times[index, 1].max(axis=1))
     elapsed = times[index] - epoch[:, None, None]
-    design, blocks = window_design(offset[index], elapsed, order, vertical=vertical)
+    offset = _along(place[index], elapsed, order) - where[index][:, :, None]
+    design, blocks = window_design(offset, elapsed, order, vertical=vertical)
     return epoch, dops(design if order else 0.5 * design, blocks)
+
+
+def _along(place: FloatArray, elapsed: FloatArray, order: int) -> FloatArray:
+    """Positions (W, M, L, 3) on the polynomials that fit the track best, window by window."""
+    windows = len(place)
+    scale = np.abs(elapsed).max(axis=(1, 2), keepdims=True)
+    rows = (elapsed / scale)[..., None] ** np.arange(order + 1)
+    rows = rows.reshape(windows, -1, order + 1)
+    fitted = rows @ (np.linalg.pinv(rows) @ place.reshape(windows, -1, 3))
+    return fitted.reshape(place.shape)
 
 
 def graph_dops(mission: Mission, segment: SegmentResult, *, vertical: bool = False) -> Dops:

@@ -21,7 +21,7 @@ from ubl_graph.result import Result, SegmentResult
 from ubl_graph.smoother import AMBIGUOUS_COST, smooth
 from ubl_graph.solve.choice import choose
 from ubl_graph.solve.rounds import solve
-from ubl_graph.track import Track, mirror_images, place, track_of
+from ubl_graph.track import Track, mirror_images, place, track_of, unanchored
 
 #: A second track nearer than so many metres is no second track.
 LEAST_SEPARATION = 1.0
@@ -159,9 +159,10 @@ def _observability(
     heard = np.unique(solved.residuals.beacon)
     beacons = np.stack([result.beacons[str(name)].value for name in heard])
     measured = tuple(b for b in problem.blocks if not b.name.endswith(" prior"))
+    turned = unanchored(model) is not None
     return Observability(
-        _rank(replace(problem, blocks=measured), x, beacons),
-        _rank(problem, x, beacons),
+        _turned(_rank(replace(problem, blocks=measured), x, beacons), turned),
+        _turned(_rank(problem, x, beacons), turned),
         graph_dops(mission, solved),
         solved.trajectory.t,
         _mirror(mission, model, problem, x, beacons),
@@ -204,6 +205,17 @@ def _rank(problem: Problem, x: FloatArray, beacons: FloatArray) -> Rank:
         scale[columns] = sizes[name.split()[0]] / layout.unit(name)
     columns = {name: np.searchsorted(kept, c).tolist() for name, c in states.items()}
     return rank(reduced(jacobian, turn), columns, scale=scale[kept], least=1.0 / UNOBSERVED_SHARE)
+
+
+def _turned(found: Rank, open_: bool) -> Rank:
+    """The rank without the turn of the whole track about a lone beacon, where that is open.
+
+    The motion prior's residuals turn with the track, so that its rows, linearised where they are
+    not zero, seem to hold it.
+    """
+    if not open_ or found.unobserved:
+        return found
+    return replace(found, rank=found.rank - 1, unobserved=("the turn about the beacon",))
 
 
 def _sizes(problem: Problem, x: FloatArray, beacons: FloatArray) -> dict[str, float]:
