@@ -12,7 +12,7 @@ from scipy import sparse
 import ubl_graph
 from ubl_graph.acoustics import SoundSpeedProfile
 from ubl_graph.beacon import Beacon
-from ubl_graph.errors import DataError
+from ubl_graph.errors import ConfigurationError, DataError
 from ubl_graph.graph import build_problem, model_segment
 from ubl_graph.mission import Mission, Segment, Start
 from ubl_graph.observability import (
@@ -371,3 +371,26 @@ def test_beacons_on_a_line_are_a_mirror_whatever_the_course():
     far = [np.linalg.norm(p[:, None] - line, axis=2) for p in (track, image)]
     np.testing.assert_allclose(far[0], far[1], rtol=1e-9)
     assert np.linalg.norm(image - track, axis=1).min() > 50.0
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda: dops([[1.0, np.nan]], {"position": [0]}),
+        lambda: dops([1.0, 2.0], {"position": [0]}),
+        lambda: dops([[1.0, 0.0]], {"pos": [0]}),
+        lambda: dops([[1.0, 0.0]], {"position": [2]}),
+        lambda: window_design(np.ones((4, 1, 3)), np.zeros((4, 1)), 3),
+        lambda: window_dops(*_passing(), pings=0),
+        lambda: window_dops(*_passing(), order=-1),
+        lambda: window_dops(*_passing(), pings=1000),
+    ],
+)
+def test_what_has_no_dilution_is_refused(wrong):
+    with pytest.raises((DataError, ConfigurationError)):
+        wrong()
+
+
+def _passing():
+    mission, truth = straight_pass(duration=48.0, noise=0.0)
+    return mission, mission.segments[0], truth.position

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ubl_graph.arrays import ArrayLike, FloatArray
-from ubl_graph.errors import DataError
+from ubl_graph.errors import ConfigurationError, DataError
 from ubl_graph.mission import Mission, Segment
 from ubl_graph.result import SegmentResult
 
@@ -71,6 +71,13 @@ def dops(design: ArrayLike, blocks: Mapping[str, Sequence[int]]) -> Dops:
         Of the leading axes' shape; inf where a column of the block lies in a direction that the
         ranges do not tell.
 
+    Raises
+    ------
+    DataError
+        Where the design is no matrix of finite numbers.
+    ConfigurationError
+        Where a block's name is unknown, or it has a column that is not there.
+
     Examples
     --------
     Four ranges along the axes to a point in the middle of a square:
@@ -79,7 +86,17 @@ def dops(design: ArrayLike, blocks: Mapping[str, Sequence[int]]) -> Dops:
     >>> round(float(dops(square, {"position": [0, 1]}).total), 9)
     1.0
     """
-    variance = _cofactors(np.asarray(design, dtype=np.float64))
+    matrix = np.asarray(design, dtype=np.float64)
+    if matrix.ndim < 2 or not np.isfinite(matrix).all():
+        raise DataError("the design matrix is no matrix of finite numbers", "give (..., M, K)")
+    for name, columns in blocks.items():
+        if name not in PARTS or not all(0 <= c < matrix.shape[-1] for c in columns):
+            raise ConfigurationError(
+                f"columns {list(columns)} of '{name}'",
+                f"the design has {matrix.shape[-1]} columns, a block is {' or '.join(PARTS)}",
+                field="blocks",
+            )
+    variance = _cofactors(matrix)
     parts = [np.sqrt(variance[..., list(blocks.get(name, ()))].sum(axis=-1)) for name in PARTS]
     return Dops(*parts)
 
@@ -111,6 +128,7 @@ def window_design(
     dict of str to list of int
         The columns by name, as `dops` takes them.
     """
+    _check_order(order)
     offset, elapsed = (np.asarray(a, dtype=np.float64) for a in (offset, elapsed))
     axes = 3 if vertical else 2
     cosines = (offset / np.linalg.norm(offset, axis=-1, keepdims=True))[..., :axes]
@@ -162,6 +180,9 @@ def window_dops(
     DataError
         Where the segment has fewer two-way ranges than a window.
     """
+    _check_order(order)
+    if not isinstance(pings, int) or pings < 1:
+        raise ConfigurationError(f"a window of {pings!r} pings", "give 1 or more", field="pings")
     rows = segment.two_way_range
     if rows is None or len(rows) < pings:
         raise DataError(
@@ -179,6 +200,15 @@ def window_dops(
     offset = _along(place[index], elapsed, order) - where[index][:, :, None]
     design, blocks = window_design(offset, elapsed, order, vertical=vertical)
     return epoch, dops(design if order else 0.5 * design, blocks)
+
+
+def _check_order(order: int) -> None:
+    if order not in (0, 1, 2):
+        raise ConfigurationError(
+            f"a polynomial of order {order!r}",
+            "give 0, 1 or 2: TRDOP has a position, a velocity and an acceleration",
+            field="order",
+        )
 
 
 def _along(place: FloatArray, elapsed: FloatArray, order: int) -> FloatArray:
