@@ -57,10 +57,16 @@ POSITION = 1e-6
 COVARIANCE = 1e-6
 
 
-def assert_same_covariance(a: np.ndarray, b: np.ndarray) -> None:
+def assert_same_covariance(a: np.ndarray, b: np.ndarray, tolerance: float = COVARIANCE) -> None:
     """Entries differ by less than 1e-6 of what their variances allow."""
     sigma = np.sqrt(np.einsum("...ii->...i", a))
-    assert np.max(np.abs(a - b) / (sigma[..., :, None] * sigma[..., None, :])) < COVARIANCE
+    assert np.max(np.abs(a - b) / (sigma[..., :, None] * sigma[..., None, :])) < tolerance
+
+
+def rounding(matrix: np.ndarray) -> float:
+    """What rounding may make of an inverse, as a share of what its variances allow."""
+    scale = 1.0 / np.sqrt(matrix.diagonal())
+    return 50 * np.finfo(float).eps * float(np.linalg.cond(matrix * np.outer(scale, scale)))
 
 
 def assert_same_result(a: Result, b: Result) -> None:
@@ -206,8 +212,11 @@ def test_random_graphs_have_one_answer_by_both_engines(drawn):
     a, b = (problem.layout.get(s.x, "position") for s in (ours, theirs))
     assert np.abs(a - b).max() < POSITION
     one, other = Marginals(problem, ours), Marginals(problem, theirs)
+    # Six pings for eighteen unknowns are known to hundreds of metres: the two answers, a picometre
+    # apart, have covariances that differ by rounding.
+    tolerance = max(COVARIANCE, rounding(dense(problem, ours.x)[0]))
     for name in ("position", "velocity", *(n for n, _ in problem.layout.shared)):
-        assert_same_covariance(one.of(name), other.of(name))
+        assert_same_covariance(one.of(name), other.of(name), tolerance)
 
 
 @given(graphs())
