@@ -10,8 +10,13 @@ import numpy as np
 from ubl_graph.arrays import FloatArray
 from ubl_graph.graph import SegmentModel
 from ubl_graph.layout import Chain, Layout
-from ubl_graph.mission import Mission
+from ubl_graph.mission import Mission, Segment
 from ubl_graph.trajectory import Trajectory
+
+#: A track moved by less is the same one, m.
+LEAST_MOVE = 1.0
+#: Standard deviations of a known point that rule out a track: a cost of 50, odds of 1e21.
+RULED_OUT = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +144,8 @@ def mirror_images(mission: Mission, model: SegmentModel, track: Track) -> list[T
     beacon = next(b for b in mission.beacons if b.name == name).position[:2]
     axes = [track.position[-1, :2] - track.position[0, :2]]
     if _has_odometry(model):
-        return [_beyond(track, beacon, axis) for axis in axes if np.linalg.norm(axis) > 1.0]
+        images = [_beyond(track, beacon, axis) for axis in axes if np.linalg.norm(axis) > 1.0]
+        return [image for image in images if _is_conceivable(segment, track, image)]
     if segment.start is not None:
         axes.append(np.array([segment.start.east, segment.start.north]) - beacon)
     return [_reflected(track, beacon, axis) for axis in axes if np.linalg.norm(axis) > 1.0]
@@ -177,6 +183,17 @@ def _lone_beacon(model: SegmentModel) -> str | None:
 
 def _has_odometry(model: SegmentModel) -> bool:
     return model.bottom is not None or model.water is not None
+
+
+def _is_conceivable(segment: Segment, track: Track, image: Track) -> bool:
+    """Whether a moved track is another one, and no known point alone rules it out."""
+    moved = float(np.linalg.norm(image.position[0] - track.position[0]))
+    known = [np.inf]
+    if segment.start is not None:
+        known.append(segment.start.sigma)
+    if segment.position is not None and len(segment.position):
+        known.append(float(np.sqrt(segment.position.covariances[:, 0, 0].min())))
+    return LEAST_MOVE < moved < RULED_OUT * min(known)
 
 
 def _beyond(track: Track, point: FloatArray, axis: FloatArray) -> Track:
