@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import cao2017_plan as plans
 import numpy as np
@@ -22,10 +22,10 @@ from cao2017_cases import (
     closed_form_error,
 )
 from cao2017_plan import AXIS_ENDS, AXIS_WIDTH, METHODS, Plan, either_side
+from paper_rows import Row
 
 from ubl_graph.arrays import BoolArray, FloatArray
 
-Row: TypeAlias = dict[str, Any]
 Solved: TypeAlias = Sequence[tuple[Case, Found]]
 
 #: LM and Gauss-Newton count as the same within the larger of a share of the error and so much, m.
@@ -318,11 +318,3 @@ def trial_rows(solved: Solved, trial: tuple[float, float]) -> list[Row]:
         name = f"{low:g} to {high:g} m" if high < 1e9 else f"beyond {low:g} m"
         add(f"LM, rms {name} from the beacon", rms(marquardt[near]), rms(graph[near]))
     return out
-
-
-def behind(made: Sequence[Row]) -> tuple[list[Row], int]:
-    """Error rows in which the graph is not ahead, and how many hold both numbers."""
-    both = [
-        r for r in made if r["unit"] == "m" and r["baseline"] is not None and r["graph"] is not None
-    ]
-    return [r for r in both if not r["graph"] < r["baseline"]], len(both)

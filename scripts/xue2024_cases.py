@@ -334,7 +334,8 @@ def given_options(case: Case) -> Options:
     if case.track == "wandering":
         # That track was drawn with this one.
         noise[f"vertical_{name}"] = 1e-8
-    return replace(KNOWN_SEA, motion=case.motion, **noise)  # type: ignore[arg-type]
+    motion: Any = case.motion
+    return replace(KNOWN_SEA, motion=motion, **noise)
 
 
 def correlations(case: Case) -> Tally:

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from paper_rows import Row
 from xue2024_cases import WINDOW, Case, Tally
 
 TRACKS = ("straight", "accelerating", "spiral")
@@ -67,7 +68,6 @@ TABLE_4 = {
     (CA, "spiral"): (4.1545, 11.7369, 1.4260),
 }
 
-Row = dict[str, Any]
 Found = Mapping[Any, Tally]
 
 
@@ -174,16 +174,6 @@ def row(
         "baseline": baseline,
         "graph": graph,
     }
-
-
-def behind(found: list[Row]) -> tuple[list[Row], int]:
-    """Error rows in which the graph is not ahead, and how many have both numbers."""
-    both = [
-        r
-        for r in found
-        if r["unit"] == "m" and r["baseline"] is not None and r["graph"] is not None
-    ]
-    return [r for r in both if r["graph"] >= r["baseline"]], len(both)
 
 
 def best(tally: Tally, epoch: str, pings: int = WINDOW) -> float | None:

@@ -16,8 +16,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
 
 import cao2017 as script
 import cao2017_plan as plans
-import cao2017_rows as tables
 from cao2017_cases import GraphPasses, Trial, WindowPasses, run
+from paper_rows import behind
 
 from ubl_graph.errors import SolverError
 from ubl_graph.study import SerialExecutor
@@ -95,8 +95,8 @@ def whole(numbers, settings, trials, dependence):
         if row["table"] in ("A2", "A3", "A4") and row["unit"] == "m":
             assert None not in (row["baseline"], row["graph"])
     assert numbers["compared"] == 3 * 8 + settings * 2 * 9 + trials * 13
-    behind, compared = tables.behind(rows)
-    assert numbers["ahead"] == compared - len(behind)
+    lost, compared = behind(rows)
+    assert numbers["ahead"] == compared - len(lost)
 
 
 def reproduced(numbers):
@@ -264,5 +264,5 @@ def test_a_figure_that_cannot_be_written_leaves_nothing(tmp_path):
         raise OSError(28, "No space left on device")
 
     with pytest.raises(Exception, match="cannot be written"):
-        script.write(tmp_path / "out", {"rows": []}, {"figure3": broken})
+        script.write(tmp_path / "out", "cao2017.json", {"rows": []}, {"figure3": broken})
     assert list(tmp_path.iterdir()) == []

@@ -19,6 +19,7 @@ import xue2024_cases as cases
 import xue2024_figures as figures
 import xue2024_garpos as garpos
 import xue2024_rows as tables
+from paper_rows import Row, behind
 from xue2024_cases import Case, Tally
 
 from ubl_graph.errors import DataError
@@ -30,14 +31,14 @@ KEYS = {"table", "case", "quantity", "unit", "paper", "baseline", "graph"}
 WNOA, WNOJ = tables.WNOA, tables.WNOJ
 
 
-def rows_of(*which: Case) -> list[tables.Row]:
+def rows_of(*which: Case) -> list[Row]:
     """Rows after running these cases alone."""
     study = run_study(cases.run, which, executor=SerialExecutor())
     assert not study.failures, study.failures[0].summary()
     return tables.rows(cases.gathered([o.case for o in study.outcomes], study.results))
 
 
-def picked(rows: list[tables.Row], table: str, *words: str) -> dict[str, tables.Row]:
+def picked(rows: list[Row], table: str, *words: str) -> dict[str, Row]:
     """Rows of a table whose case has all words, by quantity."""
     return {
         r["quantity"]: r for r in rows if r["table"] == table and all(w in r["case"] for w in words)
@@ -70,7 +71,7 @@ def test_rows_do_not_depend_on_what_was_run():
     # A track that was told to have no noise is lost: the row says so.
     (lost,) = picked(some, "Too little motion noise", "accelerating").values()
     assert lost["graph"] > 20.0 > lost["baseline"]
-    assert tables.behind(some)[0] == [lost]
+    assert behind(some)[0] == [lost]
 
 
 def test_by_likelihood_the_graph_is_ahead_on_the_straight_track():
@@ -167,7 +168,7 @@ def test_nothing_is_left_where_a_figure_fails(tmp_path):
         raise OSError(28, "No space left on device")
 
     with pytest.raises(DataError, match="No space left"):
-        script.write(tmp_path / "out", {"rows": []}, {"figure": broken})
+        script.write(tmp_path / "out", "xue2024.json", {"rows": []}, {"figure": broken})
     assert not list(tmp_path.iterdir())
 
 
@@ -218,7 +219,7 @@ def test_the_whole_quick_run(tmp_path):
         assert both == (r["unit"] == "m" and not guarded), r
         assert all(v is None or math.isfinite(v) for v in (r["baseline"], r["graph"]))
     by_likelihood = ("Table 2", "Table 3", "Table 4", "Fig. 5", "Whole track smoothed")
-    assert not [r for r in tables.behind(rows)[0] if r["table"] in by_likelihood]
+    assert not [r for r in behind(rows)[0] if r["table"] in by_likelihood]
     assert f"ahead in {numbers['ahead']} of {numbers['compared']}" in done.stdout
 
 

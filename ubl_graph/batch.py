@@ -155,7 +155,7 @@ def smooth_batch(
     files = [Path(mission) for mission in missions]
     _check_missions(files)
     if solver is not None:
-        Options(solver=solver)  # type: ignore[arg-type]
+        Options(solver=solver)  # type: ignore[arg-type] - any word; it is judged here
     rows = [
         BatchRow(mission=file.stem, file=str(file), folder=name)
         for file, name in zip(files, folder_names(files), strict=True)

@@ -131,6 +131,7 @@ class Study(Generic[C, V]):
     @property
     def results(self) -> list[V]:
         """What the function returned, in the cases' order, without the cases that failed."""
+        # A function may return None: what is None by failure is told by the error alone.
         return [o.value for o in self.outcomes if o.error is None]  # type: ignore[misc]
 
     @property
