@@ -181,7 +181,7 @@ def window_dops(
         Where the segment has fewer two-way ranges than a window.
     """
     _check_order(order)
-    if not isinstance(pings, int) or pings < 1:
+    if pings < 1:
         raise ConfigurationError(f"a window of {pings!r} pings", "give 1 or more", field="pings")
     rows = segment.two_way_range
     if rows is None or len(rows) < pings:
