@@ -123,6 +123,7 @@ def test_the_motion_prior_is_told_apart(order, psd):
         likelihood = result.tuning.log_evidence
         assert result.tuning.chosen["motion"] == max(likelihood, key=likelihood.get)
         assert result.trajectory[""].order == order
+        assert not [w for w in result.warnings if "auto" in w]
 
 
 def test_no_noise_is_a_legal_answer():

@@ -109,11 +109,8 @@ class NoiseSearch:
         self._knobs = self._all_knobs(asked)
         self.at = {name: knob.start for name, knob in self._knobs.items()}
         self.evaluations = 0
-        problem = self._problem(self.at)
-        self._x, self._layout = (
-            start_vector(self._mission, problem.layout, tracks[0]),
-            problem.layout,
-        )
+        self._layout = self._problem(self.at).layout
+        self._x = start_vector(self._mission, self._layout, tracks[0])
         self.best = -np.inf
         self._begin(tracks)
 

@@ -109,7 +109,11 @@ def _tune(work: _Work) -> Tuning | None:
     with work.stage("noise"):
         work.mission, tuning = tuned(work.mission, lambda share: work.tell("noise", share))
     work.reset()
-    left = [name for name in automatic if name not in tuning.chosen]
+    done = set(tuning.chosen)
+    if "motion" in done:
+        # The noise of the prior that was not taken was searched too, and is of no use.
+        done |= {"acceleration_psd", "jerk_psd"}
+    left = [name for name in automatic if name not in done]
     if left:
         why = tuning.trouble or "it does not apply, or nothing in the data speaks for a number"
         work.warn("", f'{", ".join(left)} = "auto": the default stands; {why}')
