@@ -51,6 +51,7 @@ LIMITS: dict[str, dict[str, float]] = {
     "full_vs_wrapped_gtsam": {"4000": 0.06},
     "marginals_vs_gtsam": {"5000": 0.1},
     "gtsam_vs_plain_custom": {"4000": 0.05},
+    "poses_with_vs_without_pings": {"5000": 3.0},
     "online_vs_plain_custom": {"60": 0.6, "200": 0.6, "500": 0.6},
 }
 #: Ratios of 99th percentiles. A few hundred updates have three slower ones, and which updates of
@@ -78,6 +79,7 @@ TITLES = {
     "marginals_vs_gtsam": "covariances / gtsam.Marginals",
     "gtsam_vs_native": "GTSAM, our factors / C++ factors",
     "gtsam_vs_plain_custom": "GTSAM, our factors / plain custom",
+    "poses_with_vs_without_pings": "GTSAM, poses with / without pings",
     "banded_vs_scipy": "banded / scipy least_squares",
     "banded_vs_kalman": "banded / Kalman filter + RTS",
     "online_vs_plain_custom": "online p99, lm / GTSAM, plain",
@@ -100,7 +102,7 @@ class Plan:
         draw the figure.
     native : dict of int to int
         Further sizes and repeats of native GTSAM alone, for the figure.
-    plain, full, marginals, scipy, kalman : dict of int to int
+    plain, poses, full, marginals, scipy, kalman : dict of int to int
         Nodes and repeats of the other comparisons.
     scaling : dict of int to int
         Nodes and repeats of what runs in a process of its own.
@@ -112,6 +114,7 @@ class Plan:
     reported: Mapping[str, tuple[int, ...]]
     native: Mapping[int, int]
     plain: Mapping[int, int]
+    poses: Mapping[int, int]
     full: Mapping[int, int]
     marginals: Mapping[int, int]
     scipy: Mapping[int, int]
@@ -121,8 +124,8 @@ class Plan:
 
     def only_online(self) -> Plan:
         """The same with nothing but the online estimator."""
-        others = ("races", "native", "plain", "full", "marginals", "scipy", "kalman", "scaling")
-        return replace(self, **{name: {} for name in others})
+        others = ("races", "native", "plain", "poses", "full", "marginals", "scipy", "kalman")
+        return replace(self, **{name: {} for name in (*others, "scaling")})
 
 
 SIZES = (1000, 2000, 5000, 10_000, 20_000, 50_000, LARGEST)
@@ -137,6 +140,7 @@ FULL = Plan(
     },
     native={50_000: 3},
     plain={4000: 1},
+    poses={5000: 7},
     full={4000: 5},
     marginals={5000: 7},
     scipy={1000: 5},
@@ -155,6 +159,7 @@ QUICK = Plan(
     reported=FULL.reported,
     native={},
     plain=FULL.plain,
+    poses={5000: 5},
     full={4000: 5},
     marginals={5000: 5},
     scipy={1000: 5},
@@ -223,6 +228,7 @@ def measure(plan: Plan) -> tuple[dict[str, Any], list[rivals.Pair]]:
         rivals.compare_marginals: plan.marginals,
         rivals.compare_full: plan.full,
         rivals.compare_plain: plan.plain,
+        rivals.compare_poses: plan.poses,
     }
     for compare, sizes in others.items():
         for nodes, repeats in sizes.items():

@@ -36,8 +36,9 @@ from benchmark_rivals import Pair, farthest
 
 from ubl_graph import Beacon, FixedLagEstimator, Options, SoundSpeedProfile, TwoWayRange
 from ubl_graph.arrays import FloatArray
+from ubl_graph.attitude import AttitudeTrack
+from ubl_graph.builder import Builder
 from ubl_graph.factors.loss import RobustLoss
-from ubl_graph.graph import Builder
 from ubl_graph.gtsam_view import GraphView
 from ubl_graph.layout import Chain, Layout
 from ubl_graph.mission import Setup, Start, Vehicle
@@ -223,7 +224,7 @@ class Plain:
         """The ping's factor on nodes `k` and `k + 1`, as our own view makes it, but bare."""
         layout = Layout((Chain("", 0, np.array([k, k + 1.0])),), 2)
         builder = Builder(self._setup, layout)
-        block = builder.range_block(layout.chains[0], ping, np.zeros((1, 2, 3)))
+        block = builder.range_block(layout.chains[0], ping, AttitudeTrack(None))
         problem = Problem(layout, (block,), self._loss, self._psd)
         ahead = self._position + self._velocity
         x = np.concatenate([self._position, self._velocity, ahead, self._velocity])

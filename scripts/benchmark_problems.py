@@ -1,15 +1,16 @@
 """The benchmark's problems, and our side of it: the banded solver and its covariances.
 
-Two kinds of problem. The simple one has what every rival can take: constant-velocity nodes every
-2 s, one two-way ping a node, straight rays at a constant speed. The full one is a mission as users
-have it: pings whose ends fall between nodes, a DVL with its errors as states, a sound-speed state.
+Three kinds of problem. The simple one has what every rival can take: constant-velocity nodes every
+2 s, one two-way ping a node, straight rays at a constant speed. The one with poses is the same with
+a heading. The full one is a mission as users have it: pings whose ends fall between nodes, a DVL
+with its errors as states, a sound-speed state.
 """
 
 from __future__ import annotations
 
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from ubl_graph import Beacon, Mission, Options, Segment, SoundSpeedProfile, TwoW
 from ubl_graph.arrays import FloatArray
 from ubl_graph.factors.ranges import RangeBlock
 from ubl_graph.graph import build_problem, model_segment
+from ubl_graph.options import Node
 from ubl_graph.problem import Frozen, Problem
 from ubl_graph.sim import DvlErrors, Sea, Truth, ahrs, dvl, two_way_pings
 from ubl_graph.solve.banded import BandedEngine
@@ -94,7 +96,7 @@ def circle(t: FloatArray) -> tuple[FloatArray, FloatArray]:
     return position, np.stack([north, -east, np.zeros(t.shape)], axis=-1)
 
 
-def simple(nodes: int) -> Case:
+def simple(nodes: int, node: Node = "point") -> Case:
     """Problem of `nodes` nodes that every solver here can take."""
     rng = np.random.default_rng(SEED)
     t = SPACING * np.arange(nodes)
@@ -106,11 +108,23 @@ def simple(nodes: int) -> Case:
     travel = (out + back) / SPEED + SIGMA * rng.normal(size=nodes - 1)
     names = [BEACONS[i].name for i in which]
     segment = Segment("", TwoWayRange(names, t[:-1], t[1:], travel, SIGMA))
-    options = Options(estimate_sound_speed=False, loss="none", acceleration_psd=PSD)
+    options = Options(estimate_sound_speed=False, loss="none", acceleration_psd=PSD, node=node)
     profile = SoundSpeedProfile.constant(SPEED)
     case = _case(Mission((segment,), BEACONS, profile, options=options), rng)
     _require(case.nodes == nodes, f"{case.nodes} nodes instead of {nodes}")
     return case
+
+
+def posed(nodes: int) -> Case:
+    """The simple problem with poses in space: motion prior and pings, and no prior beside them."""
+    case = simple(nodes, "pose3")
+    blocks = tuple(b for b in case.problem.blocks if b.name in ("motion", "two_way_range"))
+    layout, x = case.problem.layout, case.start.copy()
+    velocity = circle(layout.chains[0].t)[1]
+    yaw = np.arctan2(velocity[:, 1], velocity[:, 0])
+    layout.put(x, "rotation", yaw[:, None] * [0.0, 0.0, 1.0])
+    layout.put(x, "velocity", np.tile([1.0, 0.0, 0.0], (nodes, 1)))
+    return replace(case, problem=replace(case.problem, blocks=blocks), start=x)
 
 
 def full(nodes: int) -> Case:
@@ -139,8 +153,11 @@ def full(nodes: int) -> Case:
 def share_between_nodes(problem: Problem) -> float:
     """Share of the pings' legs whose position is made of more than one node."""
     blocks = [b for b in problem.blocks if isinstance(b, RangeBlock)]
-    used = [(b.legs.position.weights != 0.0).sum(axis=1) for b in blocks]
-    return float(np.mean(np.concatenate(used) > 1))
+    # At a node a leg touches the three columns of its position and no other.
+    used = [
+        (b.antenna.columns.reshape(len(b) * b.antenna.legs, -1) >= 0).sum(axis=1) for b in blocks
+    ]
+    return float(np.mean(np.concatenate(used) > 3))
 
 
 def _case(mission: Mission, rng: np.random.Generator) -> Case:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 from unittest import mock
 
@@ -42,6 +42,8 @@ from ubl_graph.solve.rounds import INITIAL_LAMBDA, solve
 SCIPY_TOLERANCE = 1e-12
 #: Standard deviation of each component of the velocity at the filter's start, m/s.
 FILTER_SPEED_SIGMA = 10.0
+#: What is known of every pose beside its pings: rotation (rad) and place (m).
+ROTATION_SIGMA, PLACE_SIGMA = 0.01, 5.0
 #: Farthest that two solvers' positions of one problem may be apart, m.
 POSITION_TOLERANCE = 1e-6
 #: The same for covariances of the position, as a share of a block's largest entry.
@@ -75,7 +77,7 @@ class GraphCase:
 
 
 def wrapped(case: Case, x: FloatArray, frozen: Frozen) -> GraphCase:
-    """The problem's own graph, its range rows wrapped, as the library hands it to GTSAM."""
+    """The problem's own graph, its range rows wrapped, each asked for alone."""
     view = GraphView(case.problem)
     return GraphCase(view.graph(frozen), view.values(x), parameters_of(view))
 
@@ -116,6 +118,26 @@ def native(nodes: int) -> GraphCase:
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setlambdaInitial(INITIAL_LAMBDA)
     return GraphCase(graph, values, parameters)
+
+
+def held(nodes: int, ranges: bool) -> GraphCase:
+    """Poses with GTSAM's own motion factors, each held by a loose prior, with or without pings.
+
+    The priors, GTSAM's own, determine the poses where there are no pings.
+    """
+    case = problems.posed(nodes)
+    frozen, problem = case.problem.frozen(case.start), case.problem
+    if not ranges:
+        kept = [i for i, block in enumerate(problem.blocks) if not block.robust]
+        problem = replace(problem, blocks=tuple(problem.blocks[i] for i in kept))
+        frozen = tuple(frozen[i] for i in kept)
+    view = GraphView(problem)
+    graph, values = view.graph(frozen, batched=ranges), view.values(case.start)
+    noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([ROTATION_SIGMA] * 3 + [PLACE_SIGMA] * 3))
+    for k in range(nodes):
+        key = gtsam.symbol("x", k)
+        graph.add(gtsam.PriorFactorPose3(key, values.atPose3(key), noise))
+    return GraphCase(graph, values, parameters_of(view))
 
 
 def marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, nodes: int) -> FloatArray:
@@ -304,6 +326,14 @@ def compare_full(nodes: int, repeats: int) -> Pair:
     share = problems.share_between_nodes(case.problem)
     note = f"{share:.0%} of the pings' ends between nodes"
     return Pair("full_vs_wrapped_gtsam", nodes, *seconds.values(), difference=apart, note=note)
+
+
+def compare_poses(nodes: int, repeats: int) -> Pair:
+    """GTSAM's optimiser on poses: with one ping a node, and the same without."""
+    graphs = {name: held(nodes, ranges=name == "with_pings") for name in ("with_pings", "without")}
+    seconds, found = race(repeats, **{name: g.iterate for name, g in graphs.items()})
+    check_steps(*found.values())
+    return Pair("poses_with_vs_without_pings", nodes, *seconds.values())
 
 
 def compare_marginals(nodes: int, repeats: int) -> Pair:

@@ -37,6 +37,7 @@ TINY = script.Plan(
     reported={},
     native={2 * SMALL: 1},
     plain={SMALL: 1},
+    poses={SMALL: 1},
     full={SMALL: 1},
     marginals={SMALL: 1},
     scipy={SMALL: 1},
@@ -45,7 +46,7 @@ TINY = script.Plan(
     online={WINDOW: CONTEST},
 )
 #: One pair of each kind that compares answers, and no process of its own.
-PAIRS = replace(TINY, native={}, plain={}, kalman={}, scaling={}, online={})
+PAIRS = replace(TINY, native={}, plain={}, poses={}, kalman={}, scaling={}, online={})
 
 
 @pytest.fixture(autouse=True)
@@ -230,6 +231,7 @@ def test_both_plans_measure_what_the_gate_judges(plan):
         "full_vs_wrapped_gtsam": {str(n) for n in plan.full},
         "marginals_vs_gtsam": {str(n) for n in plan.marginals},
         "gtsam_vs_plain_custom": {str(n) for n in plan.plain},
+        "poses_with_vs_without_pings": {str(n) for n in plan.poses},
         "banded_vs_scipy": {str(n) for n in plan.scipy},
         "banded_vs_kalman": {str(n) for n in plan.kalman},
     }

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from ubl_graph import Beacon, Mission, Options, Segment, SoundSpeedProfile, TimeError, smooth
-from ubl_graph.graph import SegmentModel, build_problem, model_segment
+from ubl_graph.builder import SegmentModel
+from ubl_graph.graph import build_problem, model_segment
 from ubl_graph.sim import Sea, constant_velocity, pressure, straight_pass, two_way_pings
 from ubl_graph.solve.banded import BandedEngine
 from ubl_graph.solve.marginals import Marginals

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from ubl_graph import Mission, PositionFix, Segment, SoundSpeedProfile
+from ubl_graph.builder import FREE_ACCELERATION, FREE_POSITION
 from ubl_graph.factors.loss import WIDTHS
-from ubl_graph.graph import FREE_ACCELERATION, FREE_POSITION, build_problem, model_segment
+from ubl_graph.graph import build_problem, model_segment
 from ubl_graph.sim import straight_pass
 from ubl_graph.solve.evidence import FARTHEST, log_evidence
 from ubl_graph.trajectory import process_noise, transition

@@ -13,6 +13,7 @@ from ubl_graph.beacon import Beacon
 from ubl_graph.errors import ConfigurationError, DataError
 from ubl_graph.frames import GeodeticOrigin
 from ubl_graph.io import records
+from ubl_graph.io.columns import HORIZONTAL_COVARIANCE, VERTICAL_COVARIANCE
 from ubl_graph.io.tables import naming, nearest, read_table
 
 BEACONS = (Beacon("B1", [0.0, 0.0, -10.0], turnaround=0.5), Beacon("B2", [9.0, 0.0, -10.0]))
@@ -250,6 +251,47 @@ def test_attitudes_are_degrees_in_files(write):
     assert attitude.pitch.tolist() == [0.0, 0.0]
 
 
+def test_slant_ranges(write):
+    ranges = records.read_slant_range(write("t,beacon,distance\n0,B1,12.5\n1,B2,13\n"))
+    assert ranges.beacon.tolist() == ["B1", "B2"]
+    assert ranges.distance.tolist() == [12.5, 13.0]
+    assert ranges.sigma.tolist() == [1.0, 1.0]
+
+
+def test_headings_and_angular_rates_are_degrees_in_files(write):
+    heading = records.read_heading(write("t,heading,sigma\n0,-90,2\n"))
+    np.testing.assert_allclose(heading.heading, [-np.pi / 2], rtol=1e-15)
+    np.testing.assert_allclose(heading.sigma, np.deg2rad(2), rtol=1e-15)
+    gyro = records.read_angular_rate(write("t,about_down,about_right,sigma\n0,5,-3,0.1\n"))
+    np.testing.assert_allclose(gyro.rate, np.deg2rad([[0, 3, -5]]), rtol=1e-15)
+    np.testing.assert_allclose(gyro.sigma, np.deg2rad(0.1), rtol=1e-15)
+
+
+PLANE = "t_from,t_to,forward,right,about_down"
+
+
+def test_odometry_of_a_plane(write):
+    steps = records.read_odometry(write(f"{PLANE}\n0,1,1.5,0.1,10\n1,2,1.5,0.1,-10\n"))
+    assert (steps.dimension, steps.covariance) == (2, None)
+    assert steps.translation.tolist() == [[1.5, -0.1, 0.0]] * 2
+    np.testing.assert_allclose(steps.about_down, np.deg2rad([10, -10]), rtol=1e-15)
+    steps = records.read_odometry(write(f"{PLANE},sigma,sigma_turn\n0,1,1,0,0,0.1,2\n"))
+    np.testing.assert_allclose(
+        steps.covariance, [np.diag([0.01, 0.01, np.deg2rad(2) ** 2])], rtol=1e-14
+    )
+
+
+def test_odometry_in_space(write):
+    steps = records.read_odometry(write(f"{PLANE},about_right\n0,1,1.5,0.1,10,-3\n"))
+    assert (steps.dimension, steps.down.tolist()) == (3, [0.0])
+    np.testing.assert_allclose(steps.rotation_vector, np.deg2rad([[0, 3, -10]]), rtol=1e-15)
+    text = f"{PLANE},down,sigma,sigma_turn\n0,1,1,0,0,0.2,0.1,2\n"
+    steps = records.read_odometry(write(text))
+    assert steps.translation.tolist() == [[1.0, 0.0, -0.2]]
+    turn = np.deg2rad(2) ** 2
+    np.testing.assert_allclose(steps.covariance, [np.diag([0.01] * 3 + [turn] * 3)], rtol=1e-14)
+
+
 def test_depths(write):
     depth = records.read_depth(write("t,depth\n0,12.5\n"))
     assert (depth.depth[0], depth.sigma[0]) == (12.5, 0.1)
@@ -262,6 +304,36 @@ def test_depths(write):
         (records.read_attitude, "t,heading\n0,721\n", (1, 2, "heading"), "721.0 degrees is outs"),
         (records.read_attitude, "t,heading\n0,nan\n", (1, 2, "heading"), "nan is not a finite"),
         (records.read_attitude, "t,heading,pitch\n0,1,-181\n", (1, 2, "pitch"), "-181.0 degrees"),
+        (records.read_slant_range, "t,beacon,distance\n0,B,-1\n", (1, 2, "distance"), "-1.0 m is"),
+        (records.read_slant_range, "t,beacon,distance\n0,B,0\n", (1, 2, "distance"), "no distance"),
+        (records.read_slant_range, "t,beacon,range\n0,B,5\n", (None, None, "distance"), "missing"),
+        (records.read_heading, "t,heading\n0,721\n", (1, 2, "heading"), "721.0 degrees is outs"),
+        (
+            records.read_angular_rate,
+            "t,about_down\n0,1\n1,600\n",
+            (2, 3, "about_down"),
+            "600.0 degrees/s is outside -572.958 to 572.958 degrees/s",
+        ),
+        (
+            records.read_angular_rate,
+            "t,about_down,about_rigth\n0,1,2\n",
+            (None, None, "about_rigth"),
+            "did you mean 'about_right'?",
+        ),
+        (records.read_odometry, f"{PLANE}\n1,1,0,0,0\n", (1, 2, "t_to"), "1.0 s is not after"),
+        (records.read_odometry, f"{PLANE}\n0,1,0,0,361\n", (1, 2, "about_down"), "361.0 degrees"),
+        (
+            records.read_odometry,
+            f"{PLANE},sigma\n0,1,0,0,0,0.1\n",
+            (None, None, "sigma_turn"),
+            "is missing",
+        ),
+        (
+            records.read_odometry,
+            f"{PLANE},sigma,sigma_turn\n0,1,0,0,0,0.1,0\n",
+            (1, 2, "sigma_turn"),
+            "0.0 degrees is outside",
+        ),
         (records.read_depth, "t,depth\n0,2e4\n", (1, 2, "depth"), "20000.0 m is outside"),
         (records.read_depth, "t,dept\n0,2\n", (None, None, "depth"), "did you mean 'dept'?"),
         (records.read_depth, "t,depth,sgima\n0,2,1\n", (None, None, "sgima"), "mean 'sigma'?"),
@@ -298,10 +370,10 @@ def test_fixes_in_metres(write):
 
 
 def test_fixes_with_covariances(write):
-    names = ",".join(records.HORIZONTAL_COVARIANCE)
+    names = ",".join(HORIZONTAL_COVARIANCE)
     flat = records.read_position(write(f"t,east,north,{names}\n0,1,2,4,1,9\n"))
     assert flat.covariances.tolist() == [[[4.0, 1.0], [1.0, 9.0]]]
-    names += "," + ",".join(records.VERTICAL_COVARIANCE)
+    names += "," + ",".join(VERTICAL_COVARIANCE)
     full = records.read_position(write(f"t,east,north,up,{names}\n0,1,2,3,4,1,9,0.1,0.2,16\n"))
     assert full.covariances.tolist() == [[[4.0, 1.0, 0.1], [1.0, 9.0, 0.2], [0.1, 0.2, 16.0]]]
 

@@ -4,17 +4,19 @@ import json
 import subprocess
 import sys
 import tomllib
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from ubl_graph.acoustics import SoundSpeedProfile
 from ubl_graph.errors import ConfigurationError, DataError
 from ubl_graph.frames import GeodeticOrigin
 from ubl_graph.io.mission_file import load_mission
 from ubl_graph.io.resolved import resolved
-from ubl_graph.mission import RECORD_KINDS, Mission
+from ubl_graph.mission import RECORD_KINDS, Mission, Setup, Start
+from ubl_graph.mission_checks import POSE_KINDS
 from ubl_graph.options import Options
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -26,7 +28,12 @@ FILES = {
     ),
     "bare.csv": "beacon,t_transmit,t_receive\nB1,0,2.5\nB1,10,12.5\n",
     "heard.csv": "beacon,t_transmit,t_receive\nB1,5,6\n",
+    "metres.csv": "t,beacon,distance\n5,B1,1000\n15,B1,1001\n",
     "dvl.csv": "t,forward,right,down\n0,1.5,0,0\n1,1.5,0,0\n",
+    "water.csv": "t,forward,right,down,reference\n0,1.5,0,0,water\n1,1.5,0,0,water\n",
+    "compass.csv": "t,heading\n0,90\n1,91\n",
+    "gyro.csv": "t,about_down\n0,1\n1,1\n",
+    "steps.csv": "t_from,t_to,forward,right,about_down\n0,1,1.5,0,1\n1,2,1.5,0,1\n",
     "attitude.csv": "t,heading\n0,90\n1,91\n",
     "depth.csv": "t,depth\n0,50\n25,51\n",
     "fixes.csv": "t,east,north\n0,1,2\n",
@@ -103,11 +110,11 @@ def test_a_full_mission(folder):
         options='[options]\nmotion = "constant_acceleration"\nmax_iterations = 7\n'
         "acceleration_psd = 1\nestimate_beacons = true\ntravel_time_sigma = 2e-4",
         data='[data]\nformat = "csv"\ntwo_way_range = "bare.csv"\none_way_range = "heard.csv"\n'
-        'velocity = "dvl.csv"\nattitude = "./attitude.csv"\ndepth = "depth.csv"\n'
-        'position = "geo.csv"',
+        'slant_range = "metres.csv"\nvelocity = "dvl.csv"\nattitude = "./attitude.csv"\n'
+        'depth = "depth.csv"\nposition = "geo.csv"',
     )
     (segment,) = mission.segments
-    assert set(segment.records()) == set(RECORD_KINDS)
+    assert set(segment.records()) == set(RECORD_KINDS) - set(POSE_KINDS)
     oracle = GeodeticOrigin(34.96, 139.26, 5.0).to_enu(34.97, 139.26, -1000.0)[0]
     assert np.array_equal(mission.beacons[0].position, oracle)
     assert mission.beacons[0].sigma.tolist() == [1.0, 2.0, 3.5]
@@ -121,6 +128,38 @@ def test_a_full_mission(folder):
     assert (mission.options.max_iterations, mission.options.acceleration_psd) == (7, 1.0)
     assert mission.options.estimate_beacons
     assert mission.uses_eigenrays
+
+
+POSES = {
+    "mission": ORIGIN,
+    "vehicle": "[vehicle]\ntransducer = { forward = 0.3 }\nantenna = { right = -1 }",
+    "start": "[start]\nt = 0\neast = 1\nnorth = 2\nheading_deg = 90\nheading_sigma_deg = 180",
+    "options": '[options]\nnode = "pose2"',
+    "data": '[data]\nslant_range = "metres.csv"\nheading = "compass.csv"\n'
+    'angular_rate = "gyro.csv"\nodometry = "steps.csv"\nvelocity = "dvl.csv"\n'
+    'position = "geo.csv"',
+}
+
+
+@pytest.mark.parametrize("node", ["pose2", "pose3"])
+def test_a_mission_of_poses_needs_neither_attitude_nor_sound_speed(folder, node):
+    options = f'[options]\nnode = "{node}"'
+    mission = load(folder, **{**POSES, "options": options, "sound_speed": ""})
+    (segment,) = mission.segments
+    assert set(POSE_KINDS) < segment.records().keys()
+    assert segment.start.heading == pytest.approx(np.pi / 2)
+    assert segment.start.heading_sigma == pytest.approx(np.pi)
+    assert segment.odometry.dimension == 2
+    assert mission.options.node == node
+
+
+def test_velocities_through_the_water_are_for_poses_too(folder):
+    data = '[data]\ntwo_way_range = "ranges.csv"\nvelocity = "water.csv"'
+    with_current = '[options]\nnode = "pose3"\nestimate_current = true'
+    assert load(folder, data=data, options=with_current).segments[0].velocity is not None
+    place = {"file": "water.csv", "kind": DataError, "row": 1, "line": 2, "field": "reference"}
+    parts = {"data": data, "options": POSES["options"]}
+    failure(folder, parts, words="needs the current as a state", **place)
 
 
 def test_name_defaults_to_the_files_name_and_start_to_its_own_sigma(folder):
@@ -211,8 +250,44 @@ def test_positions_alone_need_neither_beacon_nor_sound_speed(folder):
             "mission.origin.latitude",
             "134.96 is outside",
         ),
+        (
+            {"start": "[start]\nt = 0\neast = 0\nnorth = 0\nheading_deg = 721"},
+            "start.heading_deg",
+            "721.0 degrees is outside -720 to 720 degrees",
+        ),
+        (
+            {"start": POSES["start"].replace("= 180", "= 0")},
+            "start.heading_sigma_deg",
+            "0.0 degrees is outside",
+        ),
+        (
+            {"start": "[start]\nt = 0\neast = 0\nnorth = 0\nheading_sigma_deg = 5"},
+            "start.heading_sigma_deg",
+            "a sigma of no heading; give heading_deg too",
+        ),
+        ({"start": POSES["start"]}, "start.heading", "node = 'point' has no heading to start"),
+        ({"options": '[options]\nnode = "pose"'}, "options.node", "did you mean 'pose3'?"),
+        (
+            {"options": '[options]\nnode = "pose2"\nmotion = "constant_acceleration"'},
+            "options.motion",
+            "poses move with white noise on acceleration; set motion = 'constant_velocity'",
+        ),
+        (
+            {"options": '[options]\nnode = "pose3"\nmotion = "auto"'},
+            "options.motion",
+            "motion = 'auto' does not go with node = 'pose3'",
+        ),
+        *(
+            (
+                {"data": f'{PARTS["data"]}\n{kind} = "{file}"'},
+                "options.node",
+                f"{kind} records, which node = 'point' cannot use; set node = 'pose2' or 'pose3'",
+            )
+            for kind, file in zip(POSE_KINDS, ("compass.csv", "gyro.csv", "steps.csv"), strict=True)
+        ),
         ({"sound_speed": ""}, "sound_speed", "no sound speed; add [sound_speed]"),
         ({"beacon": ""}, "beacon", "no beacon; add [[beacon]]"),
+        ({"beacon": "", "data": '[data]\nslant_range = "metres.csv"'}, "beacon", "no beacon"),
         (
             {"beacon": PARTS["beacon"].replace("[[beacon]]", "[beacon]")},
             "beacon",
@@ -341,6 +416,44 @@ def test_wrong_data_files(folder, text, row, line, field, words):
     )
 
 
+@pytest.mark.parametrize(
+    ("file", "text", "row", "field", "words"),
+    [
+        ("metres.csv", "t,beacon,distance\n5,B11,9\n", 1, "beacon", "did you mean 'B1'?"),
+        ("metres.csv", "t,beacon,distance\n5,B1,9\n5,B1,8\n", 2, "t", "duplicate record"),
+        ("compass.csv", "t,heading\n5,1\n5,1\n", 2, "t", "duplicate record (t = 5.0)"),
+        ("gyro.csv", "t,about_down\n5,1\n5,1\n", 2, "t", "duplicate record"),
+        ("steps.csv", FILES["steps.csv"] + "1,2,1,0,0\n", 3, "t_to", "duplicate record"),
+        ("compass.csv", "t,heading\n5e3,1\n6e3,1\n", 1, "t", "5000.0 s: no record lies within"),
+        ("gyro.csv", "t,about_down\n-7e3,1\n-6e3,1\n", 1, "t", "the same epoch?"),
+        (
+            "steps.csv",
+            "t_from,t_to,forward,right,about_down\n1e9,1.1e9,1,0,0\n1.1e9,1.2e9,1,0,0\n",
+            1,
+            "t_from",
+            "the ranges' times, 5.0 to 15.0 s; are all files in the same epoch?",
+        ),
+    ],
+)
+def test_wrong_data_of_poses(folder, file, text, row, field, words):
+    (folder / file).write_text(text)
+    place = {"row": row, "line": row + 1, "field": field}
+    failure(folder, POSES, file=file, kind=DataError, words=words, **place)
+
+
+def test_odometry_that_reaches_into_the_ranges_times_is_of_their_epoch(folder):
+    (folder / "steps.csv").write_text(
+        "t_from,t_to,forward,right,about_down\n-2000,-1000,1,0,0\n-1000,10,1,0,0\n"
+    )
+    assert len(load(folder, **POSES).segments[0].odometry) == 2
+
+
+@pytest.mark.parametrize("node", ["point", "pose2", "pose3"])
+def test_nothing_that_locates_the_vehicle(folder, node):
+    parts = {"data": '[data]\ndepth = "depth.csv"', "options": f'[options]\nnode = "{node}"'}
+    failure(folder, parts, kind=DataError, words="no range and no position fix")
+
+
 def test_wrong_profiles_and_fixes_name_their_files(folder):
     (folder / "svp.csv").write_text("depth,speed\n0,1500\n10,15\n")
     parts = {"sound_speed": '[sound_speed]\nprofile = "svp.csv"'}
@@ -349,6 +462,34 @@ def test_wrong_profiles_and_fixes_name_their_files(folder):
     failure(folder, parts, file="geo.csv", field="latitude", words="need an origin")
     parts = {"data": '[data]\ntwo_way_range = "bare.csv"'}
     failure(folder, parts, file="bare.csv", row=1, line=2, field="travel_time", words="'B1' states")
+
+
+@pytest.mark.parametrize(
+    ("values", "field"),
+    [
+        ({"heading": np.nan}, "start.heading"),
+        ({"heading": 90.0}, "start.heading"),
+        ({"heading": 1.0, "heading_sigma": 0.0}, "start.heading_sigma"),
+        ({"heading": 1.0, "heading_sigma": 4.0}, "start.heading_sigma"),
+        ({"heading": 1.0, "heading_sigma": np.inf}, "start.heading_sigma"),
+        ({"sigma": -1.0}, "start.sigma"),
+    ],
+)
+def test_wrong_starts(values, field):
+    with pytest.raises(ConfigurationError) as caught:
+        Start(0.0, 1.0, 2.0, **values)
+    assert caught.value.field == field
+
+
+def test_the_setup_of_a_live_process_is_held_to_the_same():
+    sound = SoundSpeedProfile.constant(1500.0)
+    start = Start(0.0, 1.0, 2.0, heading=1.0)
+    with pytest.raises(ConfigurationError, match="has no heading to start with"):
+        Setup((), sound, start=start)
+    poses = Setup((), sound, options=Options(node="pose2"), start=start)
+    assert poses.fingerprint() != replace(poses, start=replace(start, heading=2.0)).fingerprint()
+    with pytest.raises(ConfigurationError, match="does not go with node = 'pose2'"):
+        Setup((), sound, options=Options(node="pose2", motion="constant_acceleration"))
 
 
 # Provenance
@@ -364,8 +505,10 @@ def test_resolved_missions_state_every_option_in_force(folder):
     )
     plain = resolved(mission)
     assert json.loads(json.dumps(plain, allow_nan=False)) == plain
-    # Without a grid the nodes' spacing is nothing that could be stated.
-    assert plain["options"].keys() | {"node_spacing"} == {f.name for f in fields(Options)}
+    # Without a grid the nodes' spacing is nothing that could be stated; nor is the sigma of a
+    # heading bias where the data give it.
+    unstated = {"node_spacing", "heading_bias_sigma_deg"}
+    assert plain["options"].keys() | unstated == {f.name for f in fields(Options)}
     assert plain["options"]["vertical_acceleration_psd"] == 0.5
     assert plain["options"]["rays"] == "straight"
     assert plain["options"]["sound_speed_sigma"] == 5e-3
@@ -387,6 +530,23 @@ def test_resolved_missions_state_every_option_in_force(folder):
             "start": {"t": 0.0, "east": 1.0, "north": 2.0, "sigma": 10.0},
         }
     ]
+
+
+def test_resolved_starts_state_their_heading_in_degrees(folder):
+    plain = resolved(load(folder, **POSES))
+    assert json.loads(json.dumps(plain, allow_nan=False)) == plain
+    assert plain["options"]["node"] == "pose2"
+    (segment,) = plain["segments"]
+    assert segment["start"] == {
+        "t": 0.0,
+        "east": 1.0,
+        "north": 2.0,
+        "sigma": 10.0,
+        "heading_deg": pytest.approx(90.0),
+        "heading_sigma_deg": pytest.approx(180.0),
+    }
+    assert segment["records"]["odometry"] == 2
+    assert segment["time_span"] == [0.0, 15.0]
 
 
 def test_resolved_profiles(folder):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -14,14 +14,18 @@ from online import records_of, run, survey
 from scipy.stats import chi2
 
 from ubl_graph import (
+    AngularRate,
     Attitude,
     Beacon,
     Depth,
     FixedLagEstimator,
+    Heading,
+    Odometry,
     OneWayRange,
     Options,
     PositionFix,
     Segment,
+    SlantRange,
     SoundSpeedProfile,
     Start,
     TwoWayRange,
@@ -30,11 +34,11 @@ from ubl_graph import (
 from ubl_graph.factors.loss import WIDTHS, RobustLoss
 from ubl_graph.mission import Setup
 from ubl_graph.nodes import ROUND_SPACINGS, grid_spacing, grid_times, slot_of
-from ubl_graph.online.buffer import Buffer, entry_of
+from ubl_graph.online.buffer import Buffer, columns_of, entry_of, odometry_of
 from ubl_graph.online.clock import AHEAD, BEHIND, Clock
 from ubl_graph.online.equations import WindowEquations
+from ubl_graph.online.frame import frame_of
 from ubl_graph.online.gate import REOPENS, Gate, distance, limit, step_distance
-from ubl_graph.online.rows import frame_of
 from ubl_graph.online.window import RowsOf, Window
 from ubl_graph.trajectory import (
     interpolation_covariance,
@@ -134,6 +138,52 @@ def test_a_shift_moves_every_time_and_nothing_else():
     assert (by_kind["two_way_range"].t, by_kind["two_way_range"].begin) == (-8.5, -9.0)
     assert buffer.twin(entry_of(Depth(-9.0, 1.0))) is by_kind["depth"]
     assert buffer.twin(entry_of(Depth(1.0, 1.0))) is None
+
+
+def test_records_of_poses_move_with_the_clock_and_come_back_as_they_were():
+    buffer = Buffer()
+    covariance = np.diag([1.0, 2.0, 3.0])
+    records = {
+        "slant_range": SlantRange(1.0, "B1", 50.0),
+        "heading": Heading(1.0, 0.3),
+        "angular_rate": AngularRate(1.0, 0.1, 0.2, 0.3),
+        "odometry": Odometry(1.0, 3.0, 1.5, 0.5, about_down=0.2, covariance=covariance),
+    }
+    for record in records.values():
+        buffer.add(entry_of(record))
+        assert buffer.twin(entry_of(record)).equals(entry_of(record))
+    assert buffer.twin(entry_of(SlantRange(1.0, "B2", 50.0))) is None
+    assert buffer.twin(entry_of(Odometry(1.0, 3.5, 1.5, 0.5))) is None
+    other = entry_of(Odometry(1.0, 3.0, 1.5, 0.5, about_down=0.2))
+    assert not buffer.twin(other).equals(other)
+    buffer.shift(-10.0)
+    (step,) = buffer.of("odometry")
+    assert (step.begin, step.t) == (-9.0, -7.0)
+    for kind, record in records.items():
+        (entry,) = buffer.of(kind)
+        (again,) = odometry_of([entry]) if kind == "odometry" else [columns_of(kind, [entry])]
+        for f in fields(record):
+            was, found = getattr(record, f.name), getattr(again, f.name)
+            if was is None or f.name == "source":
+                assert found is None
+            elif f.name.startswith("t"):
+                assert found.tolist() == (was - 10.0).tolist()
+            else:
+                assert np.array_equal(found, was)
+
+
+def test_odometry_of_each_shape_comes_apart():
+    steps = [
+        Odometry(0.0, 1.0, 1.0, 0.0),
+        Odometry(1.0, 2.0, 2.0, 0.0, covariance=np.eye(3)),
+        Odometry(2.0, 3.0, 3.0, 0.0, 0.0, 0.0, 0.0, covariance=np.eye(6)),
+        Odometry(3.0, 4.0, 4.0, 0.0),
+    ]
+    found = odometry_of([entry_of(s) for s in steps])
+    assert [s.forward.tolist() for s in found] == [[1.0, 4.0], [2.0], [3.0]]
+    assert [s.dimension for s in found] == [2, 2, 3]
+    assert [s.covariance is None for s in found] == [True, False, False]
+    assert odometry_of([]) == []
 
 
 # -- clock --

@@ -9,13 +9,26 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from ubl_graph import Options, SoundSpeedProfile, smooth
+from ubl_graph import (
+    Attitude,
+    Beacon,
+    Mission,
+    Odometry,
+    Options,
+    Segment,
+    SlantRange,
+    SoundSpeedProfile,
+    Start,
+    lie,
+    smooth,
+)
 from ubl_graph.errors import ConfigurationError, DataError, TimeError
 from ubl_graph.evaluation import Errors, errors_of, evaluate
 from ubl_graph.io import result_files
 from ubl_graph.io.result_files import summary, write_result
 from ubl_graph.mission import Reference
-from ubl_graph.plots import errors, residuals, slow_state, track
+from ubl_graph.plots import errors, heading, residuals, slow_state, track
+from ubl_graph.pose_trajectory import mariners_angles, mariners_slopes
 from ubl_graph.result import Result
 from ubl_graph.sim import straight_pass
 from ubl_graph.trajectory import Trajectory
@@ -195,3 +208,206 @@ def test_a_profile_that_ends_far_above_the_beacons_is_said(result):
     assert any("profile ends at" in w for w in smooth(one).warnings)
     long = SoundSpeedProfile([0.0, 0.95 * deepest], [1500.0, 1499.0])
     assert not any("profile" in w for w in smooth(replace(one, sound_speed=long)).warnings)
+
+
+# -- poses --
+
+SITES = (Beacon("L0", [0.0, 80.0, 0.0]), Beacon("L1", [60.0, -20.0, 0.0]))
+#: A third of a circle, 1 m and 3 degrees a step, and how far from the beacons.
+STEPS, TURN = 40, np.deg2rad(3.0)
+
+
+def drive(**options) -> Result:
+    """A car on a plane: odometry that joins all, ranges to two beacons, a known start."""
+    t = np.arange(STEPS + 1.0)
+    yaw = TURN * t
+    step = np.stack([np.cos(yaw[:-1]), np.sin(yaw[:-1])], axis=1)
+    place = np.concatenate([np.zeros((1, 2)), np.cumsum(step, axis=0)])
+    rng = np.random.default_rng(4)
+    names = np.array([b.name for b in SITES])[np.arange(STEPS) % 2]
+    site = np.array([b.position[:2] for b in SITES])[np.arange(STEPS) % 2]
+    distance = np.linalg.norm(place[1:] - site, axis=1) + rng.normal(0.0, 0.3, STEPS)
+    distance[7] += 40.0
+    given = options.pop("covariance", True)
+    covariance = np.tile(np.diag([1e-4, 1e-4, 1e-6]), (STEPS, 1, 1)) if given else None
+    segment = Segment(
+        odometry=Odometry(t[:-1], t[1:], 1.0, 0.0, about_down=-TURN, covariance=covariance),
+        slant_range=SlantRange(t[1:], names, distance, 0.3),
+        start=Start(0.0, 0.0, 0.0, sigma=1.0, heading=np.pi / 2),
+    )
+    base = {"node": "pose2", "estimate_sound_speed": False}
+    options = Options(**{**base, **options})
+    return smooth(Mission((segment,), SITES, SoundSpeedProfile.constant(1500.0), options=options))
+
+
+@pytest.fixture(scope="module")
+def driven() -> Result:
+    return drive()
+
+
+@pytest.fixture(scope="module")
+def dived() -> Result:
+    """Poses in space, with velocities and an attitude reference."""
+    mission, _ = straight_pass(seed=2)
+    segment = mission.segments[0]
+    t = np.arange(0.0, segment.two_way_range.t_receive.max(), 1.0)
+    read = Attitude(t, 0.4, 0.05, -0.03, sigma=0.02)
+    options = replace(mission.options, node="pose3")
+    return smooth(replace(mission, segments=(replace(segment, attitude=read),), options=options))
+
+
+def test_slopes_of_the_mariners_angles_by_differences():
+    rotation = lie.rotation(np.random.default_rng(0).normal(size=(100, 3)))
+    slopes = mariners_slopes(rotation)
+    for axis in range(3):
+        turn = np.zeros((1, 3))
+        turn[0, axis] = 1e-6
+        ahead, behind = (mariners_angles(lie.rotation(s * turn) @ rotation) for s in (1.0, -1.0))
+        change = np.angle(np.exp(1j * (ahead - behind))) / 2e-6
+        np.testing.assert_allclose(slopes[:, :, axis], change, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("mission", ["driven", "dived"])
+def test_trajectory_file_of_poses(tmp_path, request, mission):
+    result = request.getfixturevalue(mission)
+    write_result(result, tmp_path, figures=False)
+    rows = rows_of(tmp_path / "trajectory.csv")
+    found = result.segments[0].trajectory
+    assert list(rows[0])[:12] == list(result_files.TRAJECTORY_COLUMNS)
+    names = ("heading_deg", "pitch_deg", "roll_deg")
+    written = np.deg2rad([[float(r[n]) for n in names] for r in rows])
+    np.testing.assert_allclose(written, found.attitude, atol=1e-7)
+    sd = np.deg2rad([[float(r[f"sd_{n}"]) for n in names] for r in rows])
+    np.testing.assert_allclose(sd, found.attitude_sigma, atol=1e-7)
+    # A level vehicle's heading is as sure as its turn about up.
+    about_up = np.sqrt(found.pose_covariance[:, 5, 5])
+    np.testing.assert_allclose(sd[:, 0], about_up, rtol=0.01 if mission == "dived" else 1e-4)
+    if mission == "driven":
+        expected = np.pi / 2 - TURN * np.arange(STEPS + 1)
+        off = np.angle(np.exp(1j * (written[:, 0] - expected)))
+        assert np.abs(off).max() < 4.0 * sd[:, 0].max()
+        assert not written[:, 1:].any() and not sd[:, 1:].any()
+
+
+@pytest.mark.parametrize("mission", ["driven", "dived"])
+def test_pose_covariance_file(tmp_path, request, mission):
+    """Upper triangles: positions as in trajectory.csv, symmetric, never negative."""
+    result = request.getfixturevalue(mission)
+    write_result(result, tmp_path, figures=False)
+    rows = rows_of(tmp_path / "pose_covariance.csv")
+    track = result.segments[0].trajectory
+    assert [float(r["t"]) for r in rows] == track.t.tolist()
+    names = list(rows[0])[2:]
+    assert len(names) == 21
+    assert names[:2] == ["cov_east_east", "cov_east_north"]
+    assert names[-1] == "cov_about_up_about_up"
+    assert names[6] == "cov_north_north" and names[5] == "cov_east_about_up"
+    i, j = np.triu_indices(6)
+    whole = np.zeros((len(rows), 6, 6))
+    whole[:, i, j] = [[float(r[n]) for n in names] for r in rows]
+    whole[:, j, i] = whole[:, i, j]
+    np.testing.assert_allclose(whole[:, :3, :3], track.covariance, rtol=1e-8, atol=1e-15)
+    np.testing.assert_allclose(whole, track.pose_covariance, rtol=1e-8, atol=1e-15)
+    values = np.linalg.eigvalsh(whole)
+    assert (values > -1e-9 * values[:, -1:]).all()
+
+
+def test_result_file_of_poses(tmp_path, driven):
+    write_result(driven, tmp_path, figures=False)
+    told = json.loads((tmp_path / "result.json").read_text())
+    assert told["node"] == "pose2"
+    (segment,) = told["segments"]
+    assert segment["odometry_noise"] == "given"
+    assert segment["runner_up"] == driven.segments[0].runner_up
+    assert 0.0 < segment["median_sd_heading_deg"] < 10.0
+    assert set(told["shared_states"]) == {"odometry_scale", "odometry_turn_bias"}
+    options = json.loads((tmp_path / "mission.json").read_text())["options"]
+    assert options["node"] == "pose2" and options["odometry_way_noise"] == 0.02
+    start = json.loads((tmp_path / "mission.json").read_text())["segments"][0]["start"]
+    assert start["heading_deg"] == pytest.approx(90.0)
+    assert start["heading_sigma_deg"] == pytest.approx(np.rad2deg(0.1))
+
+
+@pytest.mark.parametrize(
+    ("given", "asked", "said"),
+    [(True, "both", "both"), (True, "growing", "growing"), (False, "given", "growing")],
+)
+def test_result_file_says_which_noise_odometry_was_given(given, asked, said):
+    result = drive(covariance=given, odometry_noise=asked)
+    assert summary(result)["segments"][0]["odometry_noise"] == said
+
+
+def test_points_say_nothing_of_poses(tmp_path, result):
+    write_result(result, tmp_path, figures=False)
+    assert not (tmp_path / "pose_covariance.csv").exists()
+    assert list(rows_of(tmp_path / "trajectory.csv")[0]) == list(result_files.TRAJECTORY_COLUMNS)
+    told = json.loads((tmp_path / "result.json").read_text())
+    assert told["node"] == "point"
+    assert not {"odometry_noise", "median_sd_heading_deg"} & set(told["segments"][0])
+
+
+def test_what_is_no_number_is_an_empty_field(tmp_path, driven):
+    """A reader takes it as missing; "nan" and "inf" it may not understand."""
+    segment = driven.segments[0]
+    motion = segment.trajectory.motion
+    node = motion.node.copy()
+    node[3] = np.nan
+    covariance = segment.trajectory.covariance.copy()
+    covariance[3] = np.inf
+    spoilt = replace(segment.trajectory, motion=replace(motion, node=node), covariance=covariance)
+    write_result(
+        replace(driven, segments=(replace(segment, trajectory=spoilt),)), tmp_path, figures=False
+    )
+    for name, empty in (("trajectory.csv", 7), ("pose_covariance.csv", 21)):
+        rows = rows_of(tmp_path / name)
+        assert sum(not value for k, value in rows[3].items() if k != "segment") == empty
+        for row in rows[:3] + rows[4:]:
+            assert all(np.isfinite(float(v)) for k, v in row.items() if k != "segment")
+
+
+def test_figures_of_poses(driven, dived):
+    for result, panels in ((driven, 2), (dived, 3)):
+        figure = heading(result)
+        FigureCanvasAgg(figure).draw()
+        assert len(figure.axes) == panels
+        for axes in figure.axes:
+            assert axes.get_ylabel() and axes.lines
+            drawn = np.concatenate([np.asarray(x.get_ydata(), dtype=float) for x in axes.lines])
+            assert np.isfinite(drawn).all()
+            low, high = axes.get_ylim()
+            assert ((drawn >= low) & (drawn <= high)).all()
+
+
+def test_a_heading_that_passes_north_is_drawn_in_pieces():
+    """No line joins 359 degrees with 1."""
+    result = drive()
+    angle = np.rad2deg(result.segments[0].trajectory.attitude[:, 0])
+    assert np.abs(np.diff(angle)).max() > 180.0
+    lines = heading(result).axes[0].lines
+    assert len(lines) == 2
+    for line in lines:
+        assert np.abs(np.diff(line.get_ydata())).max() < 10.0
+
+
+def test_slant_ranges_are_drawn_in_metres_and_far_ones_at_the_edge(driven):
+    figure = residuals(driven)
+    assert {axes.get_ylabel() for axes in figure.axes} == {"model - range, m"}
+    assert figure.axes[-1].get_xlabel() == "t, number of the pose"
+    table = driven.residuals
+    far = np.abs(table.residual).max() * 1500.0
+    assert far == pytest.approx(40.0, abs=2.0)
+    marks = [line for axes in figure.axes for line in axes.lines]
+    edges = [line for line in marks if line.get_label() == "beyond the axis"]
+    assert sum(len(line.get_ydata()) for line in edges) == 1
+    assert all(axes.get_ylim()[1] < 0.5 * far for axes in figure.axes)
+    drawn = sum(len(m.get_ydata()) for m in marks if m.get_label() in ("used", "down-weighted"))
+    assert drawn == len(table) - 1
+
+
+def test_the_scale_of_slant_ranges_is_drawn_as_their_own():
+    result = drive(estimate_sound_speed=True, sound_speed_sigma=0.05)
+    (axes,) = slow_state(result, "sound_speed").axes
+    assert axes.get_ylabel() == "ranges too long by, %"
+    state = result.segments[0].slow["sound_speed"]
+    drawn = axes.lines[0].get_ydata()
+    np.testing.assert_allclose(drawn, 100.0 * (np.exp(state.value[:, 0]) - 1.0))

@@ -19,13 +19,20 @@ from ubl_graph.errors import DataError, SolverError, TimeError
 from ubl_graph.frames import GeodeticOrigin
 from ubl_graph.io.mission_file import load_setup
 from ubl_graph.measurements import (
+    ANGULAR_RATE_SIGMA,
     ATTITUDE_SIGMA,
     DEPTH_SIGMA,
+    HEADING_SIGMA,
     POSITION_SIGMA,
+    SLANT_RANGE_SIGMA,
     VELOCITY_SIGMA,
+    AngularRate,
+    Heading,
+    Odometry,
     PositionFix,
 )
 from ubl_graph.mission import Setup, Start
+from ubl_graph.online.estimator import FixedLagEstimator
 from ubl_graph.online.json_records import FORMS, record_content
 from ubl_graph.online.protocol import MAX_LINE, Measurement, Query, Refused, parse
 from ubl_graph.online.session import Session
@@ -58,6 +65,13 @@ SOUND: dict[str, dict[str, Any]] = {
         "t_receive": 10.5,
         "sigma": 1e-4,
     },
+    "slant_range": {
+        "type": "slant_range",
+        "t": 10.0,
+        "beacon": "B2",
+        "distance": 150.0,
+        "sigma": 0.5,
+    },
     "velocity": {
         "type": "velocity",
         "t": 10.0,
@@ -74,6 +88,28 @@ SOUND: dict[str, dict[str, Any]] = {
         "pitch": 2.0,
         "roll": -3.0,
         "sigma": 0.5,
+    },
+    "heading": {"type": "heading", "t": 10.0, "heading": 271.5, "sigma": 2.0},
+    "angular_rate": {
+        "type": "angular_rate",
+        "t": 10.0,
+        "about_forward": 0.5,
+        "about_right": -0.25,
+        "about_down": 3.0,
+        "sigma": 0.1,
+    },
+    "odometry": {
+        "type": "odometry",
+        "t_from": 10.0,
+        "t_to": 11.0,
+        "forward": 1.5,
+        "right": 0.25,
+        "down": -0.5,
+        "about_forward": 0.1,
+        "about_right": -0.2,
+        "about_down": 10.0,
+        "sigma": 0.05,
+        "sigma_turn": 0.3,
     },
     "depth": {"type": "depth", "t": 10.0, "depth": 50.0, "sigma": 0.2},
     "position": {"type": "position", "t": 10.0, "east": 1, "north": 2, "up": -3, "sigma": 4},
@@ -145,6 +181,18 @@ def test_what_may_be_left_out():
     attitude = made(without("attitude", "pitch", "roll", "sigma"))
     assert (attitude.pitch[0], attitude.roll[0], attitude.sigma[0]) == (0.0, 0.0, ATTITUDE_SIGMA)
     assert attitude.heading[0] == math.pi / 2
+    assert made(without("slant_range", "sigma")).sigma[0] == SLANT_RANGE_SIGMA
+    assert made(without("heading", "sigma")).sigma[0] == HEADING_SIGMA
+    gyro = made(without("angular_rate", "about_forward", "about_right", "sigma"))
+    assert gyro.rate[0].tolist() == [0.0, 0.0, -math.radians(3.0)]
+    assert gyro.sigma[0] == ANGULAR_RATE_SIGMA
+    step = made(without("odometry", "sigma", "sigma_turn", "down", "about_forward"))
+    assert (step.dimension, step.covariance, step.down[0]) == (3, None, 0.0)
+    step = made(without("odometry", "down", "about_forward", "about_right"))
+    assert (step.dimension, step.down) == (2, None)
+    np.testing.assert_allclose(
+        step.covariance[0], np.diag([0.0025, 0.0025, math.radians(0.3) ** 2]), rtol=1e-14
+    )
     assert made(without("depth", "sigma")).sigma[0] == DEPTH_SIGMA
     fix = made(without("position", "up", "sigma"))
     assert (fix.up, fix.sigma[0]) == (None, POSITION_SIGMA)
@@ -179,6 +227,41 @@ def test_a_record_with_a_covariance_is_shown_with_it():
         "north": 3.0,
         "covariance": [[4.0, 1.0], [1.0, 9.0]],
     }
+
+
+@pytest.mark.parametrize("size", [3, 6])
+def test_odometry_with_a_covariance_of_its_own_is_shown_with_it(size):
+    covariance = np.eye(size)
+    covariance[0, 1] = covariance[1, 0] = 0.5
+    content = record_content(Odometry(1.0, 2.0, 3.0, 4.0, covariance=covariance))
+    assert content == {
+        "type": "odometry",
+        "t_from": 1.0,
+        "t_to": 2.0,
+        "forward": 3.0,
+        "right": 4.0,
+        "about_down": 0.0,
+        "covariance": covariance.tolist(),
+    }
+
+
+@pytest.mark.parametrize(
+    "record",
+    [Heading(1.0, 1.0), AngularRate(1.0, about_down=0.1), Odometry(0.0, 1.0, 1.0, 0.0)],
+    ids=lambda r: type(r).__name__,
+)
+def test_points_refuse_what_only_poses_can_use(record):
+    estimator = FixedLagEstimator.of(SETUP)
+    with pytest.raises(DataError, match=r"node = 'point' cannot use .* set node = 'pose2'"):
+        estimator.add(record)
+    # Nothing of it is left behind.
+    assert estimator.health()["sensors"] == {}
+    assert estimator.health()["t"] is None
+
+
+def test_a_start_with_a_heading_is_shown_in_degrees():
+    content = record_content(Start(1.0, 2.0, 3.0, heading=math.pi / 2, heading_sigma=math.pi / 60))
+    assert (content["heading"], content["heading_sigma"]) == (90.0, pytest.approx(3.0))
 
 
 def test_a_position_set_by_hand_is_shown_as_it_came():
@@ -269,6 +352,18 @@ ABSURD = {
     "reference with a zero byte": ({**SOUND["velocity"], "reference": "water\0"}, "neither"),
     "heading": ({**SOUND["attitude"], "heading": 721}, "721.0 degrees is outside -720 to 720"),
     "pitch": ({**SOUND["attitude"], "pitch": 181}, "outside -180 to 180 degrees"),
+    "no distance": ({**SOUND["slant_range"], "distance": 0}, "0.0 m is no distance"),
+    "slant range of a stranger": ({**SOUND["slant_range"], "beacon": "b2"}, "did you mean 'B2'"),
+    "compass": ({**SOUND["heading"], "heading": -721}, "outside -720 to 720 degrees"),
+    "gyro": (
+        {**SOUND["angular_rate"], "about_right": 600},
+        "600.0 degrees/s is outside -572.958 to 572.958 degrees/s",
+    ),
+    "odometry back in time": ({**SOUND["odometry"], "t_to": 10.0}, "not after t_from"),
+    "odometry of two turns": ({**SOUND["odometry"], "about_down": 361}, "outside -360 to 360"),
+    "half a noise": (without("odometry", "sigma"), "'sigma': the key is missing; sigma and"),
+    "the other half": (without("odometry", "sigma_turn"), "'sigma_turn': the key is missing"),
+    "no noise at all": ({**SOUND["odometry"], "sigma_turn": 0}, "'sigma_turn': 0.0 degrees is out"),
     "far away": ({**SOUND["position"], "east": 1e8}, "'east'"),
     "set far away": ({**SOUND["set_position"], "north": 1e300}, "'north'"),
     "set without doubt": ({**SOUND["set_position"], "sigma": 0}, "field 'sigma'"),
@@ -385,6 +480,7 @@ class Estimate:
     covariance: Any = None
     status: str = "initialising"
     reasons: tuple[str, ...] = ("no position yet",)
+    rotation: Any = None
 
 
 @dataclass
@@ -493,8 +589,9 @@ def test_pings_positions_and_queries_are_answered_by_an_estimate():
         ]
     (answer,) = say(SOUND["query"])
     assert (answer["t"], answer["asked"]) == (7.0, 12.0)
-    for kind in ("velocity", "attitude", "depth"):
+    for kind in ("velocity", "attitude", "depth", "heading", "angular_rate", "odometry"):
         assert say(SOUND[kind]) == []
+    assert say(SOUND["slant_range"])[0]["type"] == "estimate"
 
 
 def test_an_estimate_without_a_position_holds_nulls():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from ubl_graph import (
     Beacon,
@@ -13,6 +14,7 @@ from ubl_graph import (
     DataError,
     LeverArm,
     Mission,
+    Options,
     Segment,
     SoundSpeedProfile,
     Start,
@@ -31,15 +33,21 @@ from ubl_graph.sim import (
     Sea,
     Truth,
     ahrs,
+    compass,
     constant_acceleration,
     constant_velocity,
     demo_survey,
+    drifting_heading,
     dvl,
     fixes,
+    gyro,
     lawn_mower,
+    odometer,
     one_way_pings,
+    planar_vehicle,
     pressure,
     sampled,
+    slant_ranges,
     straight_pass,
     two_way_pings,
     wander,
@@ -326,3 +334,176 @@ def test_dead_reckoning_needs_a_start_and_velocities():
         dead_reckoning(reckonable(None)[0])
     with pytest.raises(DataError, match="no velocities over the bottom"):
         dead_reckoning(straight_pass()[0])
+
+
+# --- vehicles that carry a heading ----------------------------------------------------------
+
+
+def circling(rate: float = 0.05) -> Truth:
+    """Level, at 2 m/s, turning clockwise at `rate` rad/s, a bias of 0.1 rad that grows."""
+
+    def motion(t):
+        angle, radius = rate * t, 2.0 / rate
+        place = radius * np.stack([1.0 - np.cos(angle), np.sin(angle), 0.0 * t], axis=1)
+        return place, 2.0 * np.stack([np.sin(angle), np.cos(angle), 0.0 * t], axis=1)
+
+    return Truth(SPAN, motion).with_heading_bias(lambda t: 0.1 + 1e-3 * t)
+
+
+def test_heading_bias_is_what_compass_and_ahrs_read_too_far():
+    truth, t = circling(), [0.0, 10.0, 20.0]
+    np.testing.assert_allclose(truth.heading_bias(t), [0.1, 0.11, 0.12])
+    assert still([0.0, 0.0, 0.0]).heading_bias(1.0) == 0.0
+    read = np.add(truth.heading(t), [0.1, 0.11, 0.12])
+    np.testing.assert_allclose(compass(truth, t, quiet(), noise=0.0).heading, read)
+    np.testing.assert_allclose(ahrs(truth, t).heading, read)
+    np.testing.assert_allclose(ahrs(truth, t, error=(0.2, 0.0, 0.0)).heading, read + 0.2)
+
+
+def test_white_noise_of_compass_and_ahrs():
+    truth, t = circling(), np.linspace(0.0, 100.0, 4000)
+    bare = ahrs(truth, t)
+    noisy = ahrs(truth, t, rng=quiet(), white=0.02, sigma=0.5)
+    for name in ("heading", "pitch", "roll"):
+        assert np.std(getattr(noisy, name) - getattr(bare, name)) == pytest.approx(0.02, rel=0.05)
+    assert (noisy.sigma == 0.5).all()
+    heading = compass(truth, t, quiet(), sigma=0.03)
+    assert np.std(heading.heading - bare.heading) == pytest.approx(0.03, rel=0.05)
+    assert (heading.sigma == 0.03).all()
+
+
+def test_gyros_by_hand():
+    truth = circling().with_attitude(lambda t: 0.05 * t, 0.1, lambda t: 0.3 * t)
+    t = np.array([0.0, 0.5, 3.0])
+    # Yaw, pitch and roll rates in body axes (Rz Ry Rx): p = roll' - yaw' sin(pitch), and so on.
+    roll = 0.3 * t
+    expected = np.stack(
+        [
+            0.3 - 0.05 * np.sin(0.1) + 0.0 * t,
+            0.05 * np.cos(0.1) * np.sin(roll),
+            0.05 * np.cos(0.1) * np.cos(roll),
+        ],
+        axis=1,
+    )
+    rates = gyro(truth, t, quiet(), noise=0.0)
+    found = np.stack([rates.about_forward, rates.about_right, rates.about_down], axis=1)
+    # At the track's first instant the difference is one-sided.
+    np.testing.assert_allclose(found, expected, atol=2e-5)
+    biased = gyro(truth, t, quiet(), noise=0.0, bias=(0.0, 0.0, 0.01))
+    np.testing.assert_allclose(biased.about_down - rates.about_down, 0.01)
+    flat = gyro(circling(), t, quiet(), noise=0.0, planar=True)
+    np.testing.assert_allclose(flat.about_down, 0.05, atol=1e-9)
+    noisy = gyro(circling(), np.linspace(0.0, 90.0, 4000), quiet(), sigma=2e-3)
+    assert np.std(noisy.about_right) == pytest.approx(2e-3, rel=0.05)
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_odometry_composes_to_the_track(planar: bool):
+    truth = circling()
+    if not planar:
+        truth = truth.with_attitude(
+            lambda t: 0.05 * t, lambda t: 0.2 * np.sin(t), lambda t: 0.3 * np.cos(t)
+        )
+    t = np.arange(0.0, 40.0)
+    steps = odometer(truth, t, quiet(), Options(), noise=0.0, planar=planar)
+    assert steps.dimension == (2 if planar else 3)
+    place, turn = truth.position(0.0)[0], Rotation.from_matrix(truth.rotation(0.0)[0])
+    for way, about in zip(steps.translation, steps.rotation_vector, strict=True):
+        place, turn = place + turn.apply(way), turn * Rotation.from_rotvec(about)
+    np.testing.assert_allclose(place, truth.position(t[-1])[0], atol=1e-9)
+    np.testing.assert_allclose(turn.as_matrix(), truth.rotation(t[-1])[0], atol=1e-9)
+
+
+def test_odometrys_lasting_errors_by_hand():
+    """Straight north at 2 m/s: read short by the scale, turned clockwise by half of the gyro's."""
+    truth = constant_velocity([0.0, 0.0, 0.0], [0.0, 2.0, 0.0], SPAN)
+    steps = odometer(
+        truth, [0.0, 5.0], quiet(), Options(), scale=0.25, turn_bias=0.02, noise=0.0, planar=True
+    )
+    assert steps.about_down[0] == pytest.approx(0.1)
+    np.testing.assert_allclose(steps.forward, 8.0 * np.cos(0.05))
+    np.testing.assert_allclose(steps.right, 8.0 * np.sin(0.05))
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_odometrys_noise_grows_with_way_and_time(planar: bool):
+    options = Options(
+        odometry_way_noise=0.03,
+        odometry_time_noise=0.02,
+        odometry_way_turn_noise_deg=0.2,
+        odometry_time_turn_noise_deg=0.3,
+    )
+    for speed, dt in ((0.0, 4.0), (2.0, 0.5)):
+        truth = constant_velocity([0.0, 0.0, 0.0], [speed, 0.0, 0.0], (0.0, 3e4))
+        t = dt * np.arange(6001)
+        steps = odometer(truth, t, quiet(), options, planar=planar)
+        along = np.sqrt(0.03**2 * speed * dt + 0.02**2 * dt)
+        about = np.deg2rad(np.sqrt(0.2**2 * speed * dt + 0.3**2 * dt))
+        moved, turned = steps.translation - [speed * dt, 0.0, 0.0], steps.rotation_vector
+        if planar:
+            moved, turned = moved[:, :2], turned[:, 2:]
+        np.testing.assert_allclose(moved.std(axis=0), along, rtol=0.05)
+        np.testing.assert_allclose(turned.std(axis=0), about, rtol=0.05)
+
+
+def test_slant_ranges_by_hand():
+    truth = constant_velocity([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], SPAN)
+    beacons = (Beacon("B1", [10.0, 3.0, 0.0]), Beacon("B2", [0.0, 0.0, -4.0]))
+    ranges = slant_ranges(truth, beacons, [6.0, 3.0], quiet(), noise=0.0)
+    assert ranges.beacon.tolist() == ["B1", "B2"]
+    np.testing.assert_allclose(ranges.distance, [5.0, 5.0])
+    noisy = slant_ranges(truth, beacons[:1], np.linspace(0.0, 9.0, 4000), quiet(), sigma=0.2)
+    off = noisy.distance - np.hypot(10.0 - np.linspace(0.0, 9.0, 4000), 3.0)
+    assert np.std(off) == pytest.approx(0.2, rel=0.05)
+
+
+def test_drifting_heading_is_what_it_says():
+    one, truth = drifting_heading(3)
+    again, _ = drifting_heading(3)
+    other, _ = drifting_heading(4)
+    attitude = one.segments[0].attitude
+    np.testing.assert_array_equal(attitude.heading, again.segments[0].attitude.heading)
+    assert not np.array_equal(attitude.heading, other.segments[0].attitude.heading)
+    assert one.options.heading_bias_sigma_deg == 2.0
+    assert one.options.heading_bias_walk_deg == 0.5
+    assert np.rad2deg(truth.heading_bias(0.0)[0]) == pytest.approx(2.0)
+    off = attitude.heading - truth.heading(attitude.t) - truth.heading_bias(attitude.t)
+    off = (off + np.pi) % (2.0 * np.pi) - np.pi
+    assert np.rad2deg(off.std()) == pytest.approx(one.options.attitude_noise_deg, rel=0.05)
+    # It rolls, comes from far away, and passes over the beacon.
+    assert np.abs(truth.roll(attitude.t)).max() > 0.05
+    away = np.hypot(*(one.segments[0].reference.position[:, :2]).T)
+    assert away.max() > 1500.0
+    assert away.min() < 40.0
+
+
+def test_drifting_heading_draws_what_the_options_expect():
+    runs = [drifting_heading(s, heading_bias_deg=None, lines=1, run_in=1000.0) for s in range(200)]
+    first = np.rad2deg([truth.heading_bias(0.0)[0] for _, truth in runs])
+    assert np.std(first) == pytest.approx(2.0, rel=0.15)
+    assert abs(np.mean(first)) < 4.0 * 2.0 / np.sqrt(200)
+    walked = np.rad2deg([truth.heading_bias(t := 800.0)[0] for _, truth in runs]) - first
+    assert np.std(walked) == pytest.approx(0.5 * np.sqrt(t / 3600.0), rel=0.15)
+    start = [m.segments[0].start for m, _ in runs]
+    off = [s.east - truth.position(0.0)[0, 0] for s, (_, truth) in zip(start, runs, strict=True)]
+    assert np.std(off) == pytest.approx(start[0].sigma, rel=0.15)
+
+
+def test_planar_vehicle_is_planar():
+    mission, truth = planar_vehicle(2)
+    segment = mission.segments[0]
+    assert mission.options.node == "pose2"
+    assert segment.odometry.dimension == 2
+    assert segment.odometry.covariance is None
+    assert all(b.position[2] == 0.0 for b in mission.beacons)
+    assert (truth.position(segment.slant_range.t)[:, 2] == 0.0).all()
+    exact, _ = planar_vehicle(2, noise=0.0)
+    ranges = exact.segments[0].slant_range
+    places = np.stack([b.position for b in mission.beacons])[mission.beacon_numbers(ranges.beacon)]
+    np.testing.assert_allclose(
+        ranges.distance, np.linalg.norm(truth.position(ranges.t) - places, axis=1)
+    )
+    heading = exact.segments[0].heading
+    off = np.exp(1j * (heading.heading - truth.heading(heading.t)))
+    np.testing.assert_allclose(off, np.exp(1j * truth.heading_bias(heading.t)))
+    assert np.abs(truth.heading_bias(0.0)) > 1e-3

@@ -5,10 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from ubl_graph.arrays import BoolArray, FloatArray
+from ubl_graph.builder import SegmentModel
 from ubl_graph.factors.ranges import RangeBlock
-from ubl_graph.graph import SegmentModel
 from ubl_graph.layout import KINEMATIC, Chain
+from ubl_graph.measurements import SlantRange
 from ubl_graph.mission import Mission
+from ubl_graph.options import Options
+from ubl_graph.pings import Pings, measured_times
+from ubl_graph.pose_assembly import pose_trajectory
 from ubl_graph.problem import Problem
 from ubl_graph.result import RangeResiduals, SegmentResult, Shared, SlowState, Status
 from ubl_graph.solve.marginals import Marginals
@@ -32,6 +36,8 @@ def assemble_segment(
     rival_track: FloatArray | None,
     number: int,
     solver: str,
+    runner_up: float | None,
+    options: Options,
 ) -> SegmentResult:
     """Everything that a user reads of one segment.
 
@@ -49,22 +55,16 @@ def assemble_segment(
         Of the problem among those of the mission.
     solver : str
         What solved it.
+    runner_up : float or None
+        How much dearer the next best track elsewhere is.
+    options : Options
+        Of the mission.
     """
     layout = problem.layout
-    states = KINEMATIC[: layout.order]
-    following = slice(chain.nodes.start, chain.nodes.stop - 1)
-    joint = NodeCovariance(
-        marginals.joint(states)[chain.nodes], marginals.following(states)[following]
-    )
-    trajectory = Trajectory(
-        chain.t,
-        layout.get(solution.x, "position")[chain.nodes],
-        layout.get(solution.x, "velocity")[chain.nodes],
-        layout.get(solution.x, "acceleration")[chain.nodes] if layout.order == 3 else None,
-        np.ascontiguousarray(joint.node[:, :3, :3]),
-        problem.psd,
-        joint,
-    )
+    if layout.node == "point":
+        trajectory = _point_trajectory(problem, solution, marginals, chain)
+    else:
+        trajectory = pose_trajectory(problem, solution.x, marginals, chain, options)
     slow = {name: _slow_state(problem, solution, marginals, chain, name) for name, _ in layout.slow}
     residuals = _range_residuals(problem, solution, chain, model)
     limit = _unobserved_sigma(residuals, slow.get("clock_offset"))
@@ -85,6 +85,28 @@ def assemble_segment(
         chi_square,
         dof,
         None if rival_track is None else rival_track[chain.nodes],
+        runner_up,
+    )
+
+
+def _point_trajectory(
+    problem: Problem, solution: Solution, marginals: Marginals, chain: Chain
+) -> Trajectory:
+    """The trajectory of a chain of point nodes."""
+    layout = problem.layout
+    states = KINEMATIC[: layout.order]
+    following = slice(chain.nodes.start, chain.nodes.stop - 1)
+    joint = NodeCovariance(
+        marginals.joint(states)[chain.nodes], marginals.following(states)[following]
+    )
+    return Trajectory(
+        chain.t,
+        layout.get(solution.x, "position")[chain.nodes],
+        layout.get(solution.x, "velocity")[chain.nodes],
+        layout.get(solution.x, "acceleration")[chain.nodes] if layout.order == 3 else None,
+        np.ascontiguousarray(joint.node[:, :3, :3]),
+        problem.psd,
+        joint,
     )
 
 
@@ -118,17 +140,17 @@ def _range_residuals(
     for block, frozen in zip(problem.blocks, solution.frozen, strict=True):
         if not isinstance(block, RangeBlock) or block.chain != chain.name:
             continue
-        two_way = block.name == "two_way_range"
-        pings = model.segment.two_way_range if two_way else model.segment.one_way_range
-        assert pings is not None and frozen is not None
+        pings: Pings = getattr(model.segment, block.name)
+        assert frozen is not None
         whitened, _ = block.evaluate(solution.x, frozen, jacobian=False)
+        at_once = isinstance(pings, SlantRange)
         parts.append(
             RangeResiduals(
-                np.full(len(pings), "two_way" if two_way else "one_way"),
+                np.full(len(pings), block.name.removesuffix("_range")),
                 pings.beacon,
-                pings.t_transmit,
-                pings.t_receive,
-                np.asarray(pings.travel_time),
+                pings.t if at_once else pings.t_transmit,
+                pings.t if at_once else pings.t_receive,
+                measured_times(pings)[0],
                 frozen,
                 whitened[:, 0] * frozen,
                 problem.loss.weights(whitened[:, 0]),
@@ -144,7 +166,8 @@ def _unobserved_sigma(residuals: RangeResiduals | None, clock: SlowState | None)
         return UNOBSERVED_SIGMA
     one_way = residuals.kind == "one_way"
     offset = 0.0 if clock is None else float(np.median(clock.value))
-    flight = np.where(one_way, residuals.travel_time - offset, residuals.travel_time / 2.0)
+    ways = np.where(residuals.kind == "two_way", 2.0, 1.0)
+    flight = (residuals.travel_time - np.where(one_way, offset, 0.0)) / ways
     return UNOBSERVED_SHARE * 1500.0 * float(np.median(np.abs(flight)))
 
 

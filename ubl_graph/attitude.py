@@ -23,6 +23,7 @@ class AttitudeTrack:
     """
 
     def __init__(self, records: Attitude | None) -> None:
+        self.is_known = records is not None and len(records) > 0
         if records is None or len(records) == 0:
             records = Attitude(0.0, np.pi / 2)  # heading east: forward-left-up is east-north-up
         order = np.argsort(records.t)
@@ -31,6 +32,15 @@ class AttitudeTrack:
             world_R_body(records.heading, records.pitch, records.roll)[order]
         )
         self._slerp = Slerp(self.t, self._rotations) if len(self.t) > 1 else None
+
+    @classmethod
+    def of(cls, t: FloatArray, rotations: Rotation) -> AttitudeTrack:
+        """A track of rotations `world_R_body` at times (M,), s, strictly increasing."""
+        track = cls(None)
+        track.is_known = True
+        track.t, track._rotations = t, rotations
+        track._slerp = Slerp(t, rotations) if len(t) > 1 else None
+        return track
 
     def at(self, times: FloatArray) -> FloatArray:
         """`world_R_body` at times (M,), shape (M, 3, 3)."""

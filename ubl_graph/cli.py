@@ -6,6 +6,7 @@ Bad input ends with one line on standard error and exit code 2; nothing is writt
 from __future__ import annotations
 
 import logging
+import math
 import os
 import sys
 import time
@@ -23,6 +24,7 @@ from rich.table import Table
 from ubl_graph.errors import UblGraphError
 
 if TYPE_CHECKING:
+    from ubl_graph.arrays import FloatArray
     from ubl_graph.batch import BatchRow
     from ubl_graph.evaluation import Errors
     from ubl_graph.mission import Mission
@@ -193,8 +195,9 @@ def live(
     """Estimate as the data come: JSON lines in, JSON lines out.
 
     One record a line, in any order of time inside the lag: two_way_range, one_way_range,
-    velocity, attitude, depth, position; then query, health, reset, set_position. Every ping,
-    position and query is answered by an estimate; what is not used, by a line that says why.
+    slant_range, velocity, attitude, heading, angular_rate, odometry, depth, position; then query,
+    health, reset, set_position. Every ping, position and query is answered by an estimate; what
+    is not used, by a line that says why.
     A bad line never ends the process. It stops at the end of the input and at SIGTERM or SIGINT,
     says how it went, and exits 0.
 
@@ -291,19 +294,33 @@ def _print_segments(result: Result) -> None:
         typer.echo("chosen by the data: " + ", ".join(_chosen(result.tuning.chosen)))
     for warning in result.warnings:
         typer.echo(f"warning: {warning}", err=True)
-    table = _table("segment", "nodes", "pings", "down-weighted", "median sd, m", "status")
+    from ubl_graph.pose_trajectory import PoseTrajectory
+
+    poses = any(isinstance(s.trajectory, PoseTrajectory) for s in result.segments)
+    further = ("heading sd, deg", "next best, cost") if poses else ()
+    table = _table(
+        *("segment", "nodes", "pings", "down-weighted", "median sd, m"), *further, "status"
+    )
     for segment in result.segments:
-        sd = segment.trajectory.covariance[:, [0, 1], [0, 1]].max(axis=1) ** 0.5
+        track = segment.trajectory
+        sd = track.covariance[:, [0, 1], [0, 1]].max(axis=1) ** 0.5
         residuals = segment.residuals
-        table.add_row(
+        row = [
             segment.name or "-",
-            str(len(segment.trajectory.t)),
+            str(len(track.t)),
             "0" if residuals is None else str(len(residuals)),
             "0" if residuals is None else str(int(residuals.down_weighted.sum())),
-            f"{sorted(sd)[len(sd) // 2]:.2f}",
-            segment.status,
-        )
+            f"{_middle(sd):.2f}",
+        ]
+        if isinstance(track, PoseTrajectory):
+            row.append(f"{_middle(track.attitude_sigma[:, 0]) * 180.0 / math.pi:.2f}")
+            row.append(_number(segment.runner_up, "+{:.3g}"))
+        table.add_row(*row, segment.status)
     _show(table)
+
+
+def _middle(values: FloatArray) -> float:
+    return float(sorted(values)[len(values) // 2])
 
 
 def _chosen(values: dict[str, float | str]) -> list[str]:

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 from ubl_graph.arrays import FloatArray
-from ubl_graph.graph import FREE_POSITION, SegmentModel
+from ubl_graph.builder import FREE_POSITION, SegmentModel
 from ubl_graph.mission import Mission, Segment, Start
 from ubl_graph.nodes import order_of
 from ubl_graph.reckoning import DeadReckoning
@@ -66,10 +66,13 @@ class Starts:
         Best first; more than one where tracks apart from each other fit comparably.
     start_sigmas : float or None
         How many sigmas the start prior lies from the best track; None without such a prior.
+    runner_up : float or None
+        How much dearer the next best answer was, where the search compares whole tracks.
     """
 
     tracks: tuple[Track, ...]
     start_sigmas: float | None
+    runner_up: float | None = None
 
 
 def find_starts(mission: Mission, model: SegmentModel) -> Starts:

@@ -1,9 +1,10 @@
 """Where every unknown sits: the sole index of a problem's columns.
 
-The unknowns form one flat vector: node after node (position, velocity, acceleration where the
-prior has one, then the slow states that travel with the nodes), and behind them what all nodes
-share (DVL errors, beacons). A chain is the run of nodes of one segment; between chains nothing
-is interpolated. `Variable` says how GTSAM sees a run of columns: one key each.
+The unknowns form one flat vector: node after node (position, velocity, acceleration where the prior
+has one, for poses also their rotation and turning rate, then the slow states that travel with the
+nodes), and behind them what all nodes share (DVL errors, beacons). A chain is the run of nodes of
+one segment; between chains nothing is interpolated. `Variable` says how GTSAM sees a run of
+columns: one key each.
 """
 
 from __future__ import annotations
@@ -14,10 +15,27 @@ from functools import cached_property
 import numpy as np
 
 from ubl_graph.arrays import FloatArray, IntArray
+from ubl_graph.options import Node
 from ubl_graph.trajectory import Order, interpolation_weights, locate
 
 #: Names of the kinematic states of a node, in order; the prior's order says how many there are.
 KINEMATIC = ("position", "velocity", "acceleration")
+#: What a pose holds and how fast that changes, by kind of node, with sizes. Positions stand in the
+#: world's axes, velocities and rates in the body's. The rotation is a rotation vector of
+#: `world_R_body`, in the plane the yaw, counter-clockwise from east.
+POSE_STATES: dict[Node, tuple[tuple[str, int], ...]] = {
+    "pose2": (("position", 2), ("rotation", 1)),
+    "pose3": (("position", 3), ("rotation", 3)),
+}
+TWIST_STATES: dict[Node, tuple[tuple[str, int], ...]] = {
+    "pose2": (("velocity", 2), ("rate", 1)),
+    "pose3": (("velocity", 3), ("rate", 3)),
+}
+#: Where the columns of a node stand among position, rotation, velocity and rate of three each.
+POSE_PLACES: dict[Node, IntArray] = {
+    "pose2": np.array([0, 1, 5, 6, 7, 11]),
+    "pose3": np.arange(12),
+}
 #: Columns hold these quantities in units near what they vary by; others in SI. A log scale of
 #: 1e-5 beside metres spoils the normal equations' conditioning: GTSAM then calls sound systems
 #: indeterminate. `get`, `put` and the covariances speak SI.
@@ -29,6 +47,9 @@ UNITS: dict[str, float] = {
     "dvl_misalignment": 1e-2,
     "dvl_bias": 1e-2,
     "heading_bias": 1e-2,
+    "gyro_bias": 1e-4,
+    "odometry_scale": 1e-2,
+    "odometry_turn_bias": 1e-3,
 }
 
 
@@ -39,7 +60,8 @@ class Variable:
     Attributes
     ----------
     name : str
-        "position", "sound_speed", "beacon B1", ...
+        "position", "sound_speed", "beacon B1", ...; "pose" and "twist" for pose nodes, whose
+        position and rotation GTSAM holds under one key, as it does velocity and rate.
     index : int
         Node number, or 0 for a shared variable.
     column : int
@@ -92,17 +114,46 @@ class Layout:
         Name and size of the slow states at every node.
     shared : tuple of (str, int)
         Name and size of what all nodes share.
+    node : str
+        "point", "pose2" or "pose3".
+    still : bool
+        Whether pose nodes have no velocities: odometry alone joins them.
+    held_up : array, shape (N,), optional
+        Up at which the nodes of a planar vehicle stay, m; left out, zero.
     """
 
     chains: tuple[Chain, ...]
     order: Order
     slow: tuple[tuple[str, int], ...] = ()
     shared: tuple[tuple[str, int], ...] = ()
+    node: Node = "point"
+    still: bool = False
+    held_up: FloatArray | None = None
+
+    @cached_property
+    def kinematic(self) -> tuple[tuple[str, int], ...]:
+        """Name and size of what a node holds of the vehicle's motion."""
+        if self.node == "point":
+            return tuple((name, 3) for name in KINEMATIC[: self.order])
+        twist = () if self.still else TWIST_STATES[self.node]
+        return POSE_STATES[self.node] + twist
+
+    @cached_property
+    def kinematic_width(self) -> int:
+        """Columns of a node's motion; they stand before the slow states."""
+        return sum(size for _, size in self.kinematic)
+
+    @cached_property
+    def pose_width(self) -> int:
+        """Columns of a node's pose alone, which stand first; of a point its position's."""
+        if self.node == "point":
+            return 3
+        return sum(size for _, size in POSE_STATES[self.node])
 
     @cached_property
     def node_width(self) -> int:
         """Columns of one node."""
-        return 3 * self.order + sum(size for _, size in self.slow)
+        return self.kinematic_width + sum(size for _, size in self.slow)
 
     @cached_property
     def node_count(self) -> int:
@@ -118,7 +169,7 @@ class Layout:
     def _node_offset(self) -> dict[str, tuple[int, int]]:
         offsets: dict[str, tuple[int, int]] = {}
         at = 0
-        for name, size in [(n, 3) for n in KINEMATIC[: self.order]] + list(self.slow):
+        for name, size in self.kinematic + self.slow:
             offsets[name] = (at, size)
             at += size
         return offsets
@@ -167,10 +218,18 @@ class Layout:
     @cached_property
     def variables(self) -> tuple[Variable, ...]:
         """Every variable, in order of its columns."""
+        held = dict(self._node_offset)
+        if self.node != "point":
+            # GTSAM holds a pose under one key, and its twist under another.
+            poses = sum(size for _, size in POSE_STATES[self.node])
+            grouped = {"pose": (0, poses)}
+            if not self.still:
+                grouped["twist"] = (poses, poses)
+            held = grouped | {name: held[name] for name, _ in self.slow}
         out = [
             Variable(name, k, k * self.node_width + offset, size)
             for k in range(self.node_count)
-            for name, (offset, size) in self._node_offset.items()
+            for name, (offset, size) in held.items()
         ]
         out += [Variable(n, 0, at, size) for n, (at, size) in self._shared_offset.items()]
         return tuple(out)
@@ -179,6 +238,31 @@ class Layout:
     def variable_of_column(self) -> IntArray:
         """Number of the variable that each column belongs to, shape (size,)."""
         return np.repeat(np.arange(len(self.variables)), [v.size for v in self.variables])
+
+    def motion_columns(self, nodes: IntArray) -> IntArray:
+        """Columns of all that `nodes` (M,) hold of the motion, shape (M, kinematic_width)."""
+        return np.asarray(nodes)[:, None] * self.node_width + np.arange(self.kinematic_width)
+
+    def up_of(self, nodes: IntArray) -> FloatArray:
+        """Up (m) at which planar `nodes` (M,) stay; zero for others, whose up is an unknown."""
+        if self.node != "pose2" or self.held_up is None:
+            return np.zeros(len(nodes))
+        return self.held_up[nodes]
+
+    def positions(self, x: FloatArray) -> FloatArray:
+        """East, north, up of all nodes in the flat vector `x`, (N, 3), m."""
+        position = self.get(x, "position")
+        if position.shape[1] == 3:
+            return position
+        return np.column_stack([position, self.up_of(np.arange(self.node_count))])
+
+    def position_covariance(self, covariance: FloatArray) -> FloatArray:
+        """Covariances of positions as (N, 3, 3), m^2; the up of planar nodes is held: zero."""
+        if covariance.shape[1] == 3:
+            return covariance
+        out = np.zeros((len(covariance), 3, 3))
+        out[:, :2, :2] = covariance
+        return out
 
     def positions_at(self, chain: Chain, times: FloatArray) -> Interpolation:
         """How the position at `times` (M,) of a chain is made of node states."""
@@ -210,6 +294,14 @@ class Layout:
         )
         columns = np.where(weights[:, :, None] == 0.0, -1, columns)
         return Interpolation(columns, weights, dt, s)
+
+    def travelling_or_shared_at(self, name: str, chain: Chain, times: FloatArray) -> Interpolation:
+        """How a state that travels with the nodes, or that all share, is made at `times` (M,)."""
+        if name in dict(self.slow):
+            return self.slow_at(name, chain, times)
+        columns = np.broadcast_to(self.shared_columns(name), (len(times), 1, 1))
+        weights = np.full((len(times), 1), self.unit(name))
+        return Interpolation(columns, weights, np.ones(len(times)), np.zeros(len(times)))
 
 
 @dataclass(frozen=True, eq=False)

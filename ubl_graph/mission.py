@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
-from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field
 from functools import cached_property
 from typing import Any
@@ -12,29 +10,31 @@ from typing import Any
 import numpy as np
 
 from ubl_graph.acoustics import SoundSpeedProfile
-from ubl_graph.arrays import FloatArray, IntArray, frozen
+from ubl_graph.arrays import FloatArray, IntArray
 from ubl_graph.beacon import Beacon
-from ubl_graph.errors import ConfigurationError, DataError
+from ubl_graph.errors import DataError
 from ubl_graph.frames import GeodeticOrigin, LeverArm
-from ubl_graph.measurements import Attitude, Depth, OneWayRange, PositionFix, TwoWayRange, Velocity
+from ubl_graph.measurements import AngularRate, Heading, Odometry, Velocity
+from ubl_graph.mission_checks import (
+    RANGE_KINDS,
+    check_attitude,
+    check_beacons,
+    check_current,
+    check_duplicates,
+    check_epochs,
+    check_kinds,
+    check_located,
+    check_names,
+    check_node,
+    check_pose,
+)
 from ubl_graph.options import Options
-from ubl_graph.records import Records
+from ubl_graph.segment import RECORD_KINDS, Reference, Segment, Start
+
+__all__ = ["RECORD_KINDS", "Mission", "Reference", "Segment", "Setup", "Start", "Vehicle"]
 
 #: Relative standard deviation of the sound speed at the start: a measured profile, a constant.
 PROFILE_SIGMA, CONSTANT_SIGMA = 1e-3, 5e-3
-
-#: Depth and attitude may begin or end so much before or after the ranges, s.
-EPOCH_SLACK = 600.0
-
-#: The record kinds of a segment: attribute, class, and the columns that make a duplicate.
-RECORD_KINDS: dict[str, tuple[type[Records], tuple[str, ...]]] = {
-    "two_way_range": (TwoWayRange, ("beacon", "t_transmit", "t_receive")),
-    "one_way_range": (OneWayRange, ("beacon", "t_transmit", "t_receive")),
-    "velocity": (Velocity, ("t", "reference")),
-    "attitude": (Attitude, ("t",)),
-    "depth": (Depth, ("t",)),
-    "position": (PositionFix, ("t",)),
-}
 
 
 @dataclass(frozen=True)
@@ -51,91 +51,6 @@ class Vehicle:
     dvl: LeverArm = field(default_factory=LeverArm)
     depth_sensor: LeverArm = field(default_factory=LeverArm)
     antenna: LeverArm = field(default_factory=LeverArm)
-
-
-@dataclass(frozen=True)
-class Start:
-    """Where the vehicle was at one time, as far as is known: a prior.
-
-    Attributes
-    ----------
-    t : float
-        Seconds.
-    east, north : float
-        Metres.
-    up : float, optional
-        Metres; left out where only the horizontal position is known.
-    sigma : float
-        Standard deviation of each component, m.
-    """
-
-    t: float
-    east: float
-    north: float
-    up: float | None = None
-    sigma: float = 10.0
-
-    def __post_init__(self) -> None:
-        for name in ("t", "east", "north", "up", "sigma"):
-            value = getattr(self, name)
-            if value is not None and not np.isfinite(value):
-                raise ConfigurationError(f"{value} is not finite", field=f"start.{name}")
-        if self.sigma <= 0.0:
-            raise ConfigurationError(
-                f"a sigma of {self.sigma} m", "give metres, more than zero", field="start.sigma"
-            )
-
-
-@dataclass(frozen=True, eq=False)
-class Reference:
-    """An independent track to compare with; no estimator ever sees it.
-
-    Attributes
-    ----------
-    t : array, shape (M,)
-        Seconds, not decreasing.
-    position : array, shape (M, 3)
-        East, north, up, m.
-    """
-
-    t: FloatArray
-    position: FloatArray
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "t", frozen(self.t))
-        object.__setattr__(self, "position", frozen(self.position))
-
-
-@dataclass(frozen=True, eq=False)
-class Segment:
-    """A stretch of a mission with a trajectory of its own: one line, one dive.
-
-    Attributes
-    ----------
-    name : str
-        Label of the segment in outputs; empty where a mission has only one.
-    two_way_range, one_way_range, velocity, attitude, depth, position : records, optional
-        What was measured.
-    start : Start, optional
-        Prior on the position at one time.
-    reference : Reference, optional
-        Independent track at the pings' transmit times, for comparison alone.
-    """
-
-    name: str = ""
-    two_way_range: TwoWayRange | None = None
-    one_way_range: OneWayRange | None = None
-    velocity: Velocity | None = None
-    attitude: Attitude | None = None
-    depth: Depth | None = None
-    position: PositionFix | None = None
-    start: Start | None = None
-    reference: Reference | None = None
-
-    def records(self) -> dict[str, Records]:
-        """Record sets that are present and not empty, by kind."""
-        present = {kind: getattr(self, kind) for kind in RECORD_KINDS}
-        return {kind: r for kind, r in present.items() if r is not None and len(r) > 0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +89,8 @@ class Setup:
     origin: GeodeticOrigin | None = None
 
     def __post_init__(self) -> None:
-        _check_names(self.beacons)
+        check_names(self.beacons)
+        check_node(self.options, self.start)
 
     @property
     def beacon_names(self) -> tuple[str, ...]:
@@ -211,14 +127,7 @@ class Setup:
         DataError
             It names the record, and the beacon that may have been meant.
         """
-        unknown = ~np.isin(ranges.beacon, np.array(self.beacon_names, dtype=np.str_))
-        if unknown.any():
-            i = int(np.argmax(unknown))
-            name = str(ranges.beacon[i])
-            near = difflib.get_close_matches(name, self.beacon_names, n=1)
-            hint = f"did you mean '{near[0]}'? " if near else ""
-            known = ", ".join(self.beacon_names) or "none"
-            raise ranges.error(i, "beacon", f"unknown beacon '{name}'", f"{hint}known: {known}")
+        check_beacons(ranges, self.beacon_names)
 
     def check_current(self, velocity: Velocity) -> None:
         """Refuse velocities relative to the water where the current is no unknown.
@@ -228,14 +137,27 @@ class Setup:
         DataError
             It names the record.
         """
-        water = velocity.reference == "water"
-        if water.any() and not self.options.estimate_current:
-            raise velocity.error(
-                int(np.argmax(water)),
-                "reference",
-                "a velocity relative to the water needs the current as a state",
-                "set estimate_current = true under [options], or drop the water-track rows",
-            )
+        check_current(velocity, self.options)
+
+    def check_pose(self, records: Heading | AngularRate | Odometry) -> None:
+        """Refuse records that need poses where nodes are points.
+
+        Raises
+        ------
+        DataError
+            It names the record.
+        """
+        check_pose(records, self.options)
+
+    def check_start(self, start: Start) -> None:
+        """Refuse a heading to start with where nodes are points.
+
+        Raises
+        ------
+        ConfigurationError
+            It names the heading.
+        """
+        check_node(self.options, start)
 
     def fingerprint(self) -> str:
         """A hash of all but the name: equal for setups that mean the same."""
@@ -250,13 +172,6 @@ class Setup:
             None if self.origin is None else astuple(self.origin),
         )
         return hashlib.sha256(repr(parts).encode()).hexdigest()
-
-
-def _check_names(beacons: Sequence[Beacon]) -> None:
-    names = [b.name for b in beacons]
-    for name in names:
-        if names.count(name) > 1:
-            raise ConfigurationError(f"beacon '{name}' is there twice", field="beacon")
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,7 +213,7 @@ class Mission:
     origin: GeodeticOrigin | None = None
 
     def __post_init__(self) -> None:
-        _check_names(self.beacons)
+        check_names(self.beacons)
         if not self.segments:
             raise DataError("the mission holds no data", "name a data file or a line")
         for segment in self.segments:
@@ -338,63 +253,15 @@ class Mission:
     def _check_segment(self, segment: Segment) -> None:
         records = segment.records()
         where = f"segment '{segment.name}'" if segment.name else "the mission"
-        if not {"two_way_range", "one_way_range", "position"} & records.keys():
-            raise DataError(
-                f"{where} holds no range and no position fix", "add a file with at least one row"
-            )
+        check_located(tuple(records), where)
+        check_kinds(tuple(records), self.options, where)
+        check_node(self.options, segment.start)
         for kind, rows in records.items():
-            again = rows.duplicates(*RECORD_KINDS[kind][1])
-            if again is not None:
-                column = RECORD_KINDS[kind][1][-1]
-                value = getattr(rows, column)[again]
-                raise rows.error(
-                    again, column, f"duplicate record ({column} = {value})", "keep one of the two"
-                )
-        for kind in ("two_way_range", "one_way_range"):
-            if kind in records:
-                self.setup.check_beacons(records[kind])
-        self._check_epochs(segment)
-        self._check_attitude(segment, where)
+            check_duplicates(rows, RECORD_KINDS[kind][1])
+            if kind in RANGE_KINDS:
+                self.setup.check_beacons(rows)
+        check_epochs(segment)
+        if self.options.node == "point":
+            check_attitude(segment, self.vehicle, where)
         if segment.velocity is not None:
             self.setup.check_current(segment.velocity)
-
-    def _check_epochs(self, segment: Segment) -> None:
-        """Refuse depth and attitude that do not meet the ranges: they are of another epoch."""
-        spans = [
-            (float(np.min(r.t_receive)), float(np.max(r.t_receive)))
-            for r in (segment.two_way_range, segment.one_way_range)
-            if r is not None and len(r)
-        ]
-        if not spans:
-            return
-        begin, end = min(s[0] for s in spans), max(s[1] for s in spans)
-        for rows in (segment.depth, segment.attitude):
-            # One record may stand for all times.
-            if rows is None or len(rows) < 2:
-                continue
-            if rows.t.max() < begin - EPOCH_SLACK or rows.t.min() > end + EPOCH_SLACK:
-                raise rows.error(
-                    0,
-                    "t",
-                    f"{rows.t[0]} s: no record lies within the ranges' times, {begin} to {end} s",
-                    "are all files in the same epoch?",
-                )
-
-    def _check_attitude(self, segment: Segment, where: str) -> None:
-        if segment.attitude is not None and len(segment.attitude):
-            return
-        needs = {
-            "velocity": segment.velocity is not None,
-            "vehicle.transducer": not self.vehicle.transducer.is_zero,
-            "vehicle.depth_sensor": not self.vehicle.depth_sensor.is_zero
-            and segment.depth is not None,
-            "vehicle.antenna": not self.vehicle.antenna.is_zero and segment.position is not None,
-        }
-        for name, needed in needs.items():
-            if needed:
-                raise ConfigurationError(
-                    f"{where} has no attitude, and '{name}' cannot be turned into the world "
-                    "without it",
-                    "add an attitude file, or leave it out",
-                    field=name,
-                )

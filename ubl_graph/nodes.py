@@ -72,7 +72,7 @@ def node_times(
     least = LEAST_SHARE[order] * spacing
     # Odometry interpolates nothing: between its nodes the vehicle may do as it likes.
     longest = LONGEST_GAP if odometry else max(LONGEST_GAP, _longest_gap(options, segment))
-    return _filled(_thinned(wanted, stay, min(spacing, longest), least), longest)
+    return filled(_thinned(wanted, stay, min(spacing, longest), least), longest)
 
 
 def grid_times(
@@ -155,6 +155,9 @@ def _candidates(
     if segment.one_way_range is not None and len(segment.one_way_range):
         wanted.append(segment.one_way_range.t_receive)
         sigmas.append(float(segment.one_way_range.sigma.min()) * NOMINAL_SPEED)
+    if segment.slant_range is not None and len(segment.slant_range):
+        wanted.append(segment.slant_range.t)
+        sigmas.append(float(segment.slant_range.sigma.min()))
     if segment.position is not None and len(segment.position):
         ends = np.array([segment.position.t.min(), segment.position.t.max()])
         wanted.append(ends)
@@ -215,6 +218,9 @@ def _longest_gap(options: Options, segment: Segment) -> float:
         drift = max(options.clock_drift_walk, 1e-30) ** 2
         gaps.append(_shared(_longest_walk(options.clock_walk, error), 1, one_way.t_receive))
         gaps.append(_shared(longest_interval(2, drift, error), 2, one_way.t_receive))
+    if segment.slant_range is not None and len(segment.slant_range):
+        error = INTERPOLATION_SHARE * float(segment.slant_range.sigma.min())
+        gaps.append(_shared(longest_interval(order, larger, error), order, segment.slant_range.t))
     if segment.position is not None and len(segment.position):
         error = INTERPOLATION_SHARE * float(np.sqrt(segment.position.covariances[:, 0, 0].min()))
         gaps.append(_shared(longest_interval(order, larger, error), order, segment.position.t))
@@ -241,7 +247,7 @@ def _shared(alone: float, order: int, times: FloatArray) -> float:
     return min(alone, (alone**power * span / len(times)) ** (1.0 / (power + 1)))
 
 
-def _filled(times: FloatArray, longest: float) -> FloatArray:
+def filled(times: FloatArray, longest: float) -> FloatArray:
     """Split gaps longer than `longest` (s) into equal parts."""
     gaps = np.diff(times)
     parts = np.maximum(np.ceil(gaps / longest - 1e-9), 1.0).astype(np.int64)

@@ -14,9 +14,10 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from ubl_graph.arrays import FloatArray
+from ubl_graph.builder import SegmentModel
 from ubl_graph.errors import SolverError
 from ubl_graph.factors import linear
-from ubl_graph.graph import SegmentModel, build_problem, model_segment
+from ubl_graph.graph import build_problem, model_segment
 from ubl_graph.initial import START_LIMIT, find_starts
 from ubl_graph.measurements import OneWayRange, TwoWayRange
 from ubl_graph.mission import Mission, Segment

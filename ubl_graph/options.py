@@ -19,7 +19,19 @@ Loss = Literal["cauchy", "huber", "geman_mcclure", "dcs", "none"]
 Rays = Literal["auto", "straight", "eigenray"]
 Solver = Literal["auto", "gtsam", "banded"]
 OnlineEngine = Literal["lm", "isam2"]
+Node = Literal["point", "pose2", "pose3"]
+OdometryNoise = Literal["given", "growing", "both"]
 
+#: Options whose name begins so may be zero.
+MAY_VANISH = (
+    "dvl_",
+    "sound_speed_",
+    "current_walk",
+    "clock_",
+    "heading_bias_",
+    "gyro_",
+    "odometry_",
+)
 #: What the options that are left to the data say, and which ones may.
 AUTO: Auto = "auto"
 AUTOMATIC = ("motion", "acceleration_psd", "jerk_psd", "travel_time_sigma", "sound_speed_walk")
@@ -34,6 +46,11 @@ class Options:
     ConfigurationError
         Where a value is of the wrong kind, not finite, or outside its range.
     """
+
+    node: Node = "point"
+    """What a node of the graph is. A point moves with the attitude held at what the reference says,
+    but for a heading bias; a pose has its attitude estimated: in the plane (east, north, heading)
+    or in space. docs/nodes.md says which to take when."""
 
     motion: Motion | Auto = "constant_velocity"
     """Motion prior between nodes: white noise on acceleration or on jerk; "auto" takes the one
@@ -116,13 +133,55 @@ class Options:
     state out. Lasting errors of roll and pitch add to it by the attitude records' sigma; that of
     the heading is a state of its own, `heading_bias`, with that sigma."""
 
+    heading_bias_sigma_deg: float | None = None
+    """Standard deviation of what the heading reference lastingly reads too far clockwise, degrees.
+    Left out: the attitude records' own sigma; 5 for a vehicle that has heading records only."""
+
+    heading_bias_walk_deg: float = 0.0
+    """Random walk of the heading bias, degrees per sqrt(hour); 0 keeps it constant."""
+
+    attitude_noise_deg: float = 0.1
+    """White part of an attitude record's error, degrees, where the attitude is estimated (pose
+    nodes); the lasting part is the heading bias."""
+
+    angular_acceleration_psd: float = 1e-3
+    """Noise of the turning rates of pose nodes, rad^2/s^3: in 10 s a rate changes by 0.1 rad/s."""
+
+    gyro_bias_sigma: float = 1e-4
+    """Standard deviation of the angular rates' constant bias, rad/s (20 degrees an hour); 0 leaves
+    the state out."""
+
+    odometry_noise: OdometryNoise = "given"
+    """Noise of odometry records: their own covariance where they have one, or one that grows with
+    way and time by the four numbers below (the only one of records without any), or their sum."""
+
+    odometry_way_noise: float = 0.02
+    """Odometry's displacement noise that grows with the way, m per sqrt(m)."""
+
+    odometry_time_noise: float = 1e-3
+    """Odometry's displacement noise that grows with time, m per sqrt(s)."""
+
+    odometry_way_turn_noise_deg: float = 0.1
+    """Odometry's turning noise that grows with the way, degrees per sqrt(m)."""
+
+    odometry_time_turn_noise_deg: float = 0.01
+    """Odometry's turning noise that grows with time, degrees per sqrt(s)."""
+
+    odometry_scale_sigma: float = 0.01
+    """Standard deviation of the odometry's scale error; 0 leaves the state out."""
+
+    odometry_turn_bias_sigma_deg: float = 0.03
+    """Standard deviation of what the odometry turns too far clockwise, degrees per second (100
+    degrees an hour: a small gyro that has been zeroed); 0 leaves the state out."""
+
     start_window: float = 80.0
     """Length of the windows in which a start is searched, s."""
 
     solver: Solver = "auto"
     """GTSAM on the factor graph, or the banded normal equations; both take the same steps to the
     same answer, the banded solver some 30 times faster. Auto solves on the fast path and has GTSAM
-    confirm the answer up to 5 000 nodes; more than 64 shared unknowns GTSAM solves alone."""
+    confirm the answer up to 5 000 nodes (4 000 rows where nodes are poses); more than 64 shared
+    unknowns GTSAM solves alone."""
 
     node_spacing: float | None = None
     """Nodes on a regular grid of this spacing, s. Left out: offline at the measurements' times,
@@ -149,6 +208,8 @@ class Options:
             "rays": ("auto", "straight", "eigenray"),
             "solver": ("auto", "gtsam", "banded"),
             "engine": ("lm", "isam2"),
+            "node": ("point", "pose2", "pose3"),
+            "odometry_noise": ("given", "growing", "both"),
         }
         for name, allowed in choices.items():
             if getattr(self, name) not in allowed:
@@ -175,7 +236,17 @@ class Options:
     ) -> None:
         if (value is None and optional) or (value == AUTO and auto):
             return
-        may_vanish = name.startswith(("dvl_", "sound_speed_", "current_walk", "clock_"))
+        may_vanish = name.startswith(
+            (
+                "dvl_",
+                "sound_speed_",
+                "current_walk",
+                "clock_",
+                "heading_bias_",
+                "gyro_",
+                "odometry_",
+            )
+        )
         if (
             isinstance(value, bool)
             or not isinstance(value, (int, float))

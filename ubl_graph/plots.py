@@ -7,6 +7,7 @@ too.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from ubl_graph.arrays import FloatArray
+from ubl_graph.arrays import BoolArray, FloatArray
+from ubl_graph.attitude import AttitudeTrack
 from ubl_graph.evaluation import evaluate
-from ubl_graph.result import Result, SegmentResult
+from ubl_graph.nodes import NOMINAL_SPEED
+from ubl_graph.pose_trajectory import PoseStates, PoseTrajectory, mariners_angles
+from ubl_graph.result import RangeResiduals, Result, SegmentResult
+from ubl_graph.segment import Segment
 from ubl_graph.trajectory import Trajectory
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C6D1F")
@@ -28,9 +33,15 @@ SLOW_LABELS = {
     "clock_offset": (("clock offset, ms", 1e3),),
     "clock_drift": (("clock drift, ppm", 1e6),),
     "current": (("current east, m/s", 1.0), ("current north, m/s", 1.0)),
+    "heading_bias": (("heading bias, degrees", 180.0 / np.pi),),
 }
 #: 95 % of a two-dimensional normal distribution lie within so many standard deviations.
 ELLIPSE_95 = 2.4477
+#: Residuals beyond so many times the largest that counts are drawn at the edge: one ping that is
+#: far off must not flatten all others.
+FAR = 6.0
+#: Readings of a compass that are drawn; more are thinned out evenly.
+MOST_READINGS = 500
 
 
 def save_all(result: Result, folder: Path, beside: Beside | None = None) -> None:
@@ -38,6 +49,8 @@ def save_all(result: Result, folder: Path, beside: Beside | None = None) -> None
     figures: dict[str, Figure] = {"track": track(result, beside)}
     if result.residuals is not None:
         figures["residuals"] = residuals(result)
+    if any(isinstance(s.trajectory, PoseTrajectory) for s in result.segments):
+        figures["heading"] = heading(result)
     for name in dict.fromkeys(name for s in result.segments for name in s.slow):
         figures[name] = slow_state(result, name)
     if evaluate(result):
@@ -65,6 +78,8 @@ def track(result: Result, beside: Beside | None = None) -> Figure:
         east, north = segment.trajectory.position[:, :2].T
         label = segment.name or "smoothed"
         axes.plot(east, north, color=colour, lw=1.4, label=label, zorder=3)
+        label = None if i else "start"
+        axes.plot(east[0], north[0], "o", color=colour, mfc="white", label=label, zorder=3.5)
         _draw_ellipses(axes, segment, enlarged, colour)
     for name, tracks in (beside or {}).items():
         for i, other in enumerate(tracks):
@@ -82,61 +97,111 @@ def track(result: Result, beside: Beside | None = None) -> Figure:
 
 
 def residuals(result: Result) -> Figure:
-    """Travel-time residuals over time, one panel a beacon; down-weighted pings are marked."""
+    """Range residuals over time, one panel a beacon; down-weighted pings are marked.
+
+    Travel times are in milliseconds, slant ranges in metres.
+    """
     table = result.residuals
     assert table is not None
-    names = list(dict.fromkeys(str(b) for b in result.mission.beacon_names if b in table.beacon))
-    figure = Figure(figsize=(9.0, 1.2 + 1.6 * len(names)), layout="constrained")
-    panels = figure.subplots(len(names), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
-    for axes, name in zip(panels, names, strict=True):
-        mine = table.beacon == name
-        kept, out = mine & ~table.down_weighted, mine & table.down_weighted
-        axes.plot(
-            table.t_transmit[kept],
-            1e3 * table.residual[kept],
-            ".",
-            color=COLOURS[0],
-            ms=3,
-            label="used",
-        )
-        axes.plot(
-            table.t_transmit[out],
-            1e3 * table.residual[out],
-            "x",
-            color=RED,
-            ms=6,
-            label="down-weighted",
-        )
-        rms = 1e3 * float(np.sqrt(np.mean(table.residual[kept] ** 2))) if kept.any() else 0.0
-        axes.set_title(
-            f"{name}: {int(mine.sum())} pings, {int(out.sum())} down-weighted, rms {rms:.3f} ms",
-            fontsize=9,
-            loc="left",
-        )
-        axes.axhline(0.0, color=GREY, lw=0.8)
-        axes.set_ylabel("model - ping, ms", fontsize=8)
-        axes.grid(alpha=0.3)
-    panels[0].legend(fontsize=8, loc="upper right")
-    panels[-1].set_xlabel("time, s")
+    slant = table.kind == "slant"
+    names = [str(b) for b in result.mission.beacon_names]
+    parts = [
+        (name, in_metres, (table.beacon == name) & (slant == in_metres))
+        for name in names
+        for in_metres in (False, True)
+    ]
+    parts = [part for part in parts if part[2].any()]
+    figure = Figure(figsize=(9.0, 1.2 + 1.6 * len(parts)), layout="constrained")
+    panels = figure.subplots(len(parts), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, (name, in_metres, mine) in zip(panels, parts, strict=True):
+        factor = NOMINAL_SPEED if in_metres else 1e3
+        limit = factor * _residual_limit(table, slant == in_metres)
+        _draw_residuals(axes, table, mine, factor, limit)
+        unit, noun = ("m", "range") if in_metres else ("ms", "ping")
+        title = _residual_title(name, table, mine, factor, unit)
+        axes.set_title(title, fontsize=9, loc="left")
+        axes.set_ylabel(f"model - {noun}, {unit}", fontsize=8)
+    drawn = {line.get_label(): line for axes in panels for line in axes.lines}
+    marks = [line for label, line in drawn.items() if not str(label).startswith("_")]
+    above = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1}
+    panels[0].legend(handles=marks, ncols=3, fontsize=8, frameon=False, **above)
+    panels[-1].set_xlabel(_time_label(result))
     figure.suptitle(_title(result), fontsize=10)
     return figure
 
 
+def heading(result: Result) -> Figure:
+    """Heading of pose nodes over time, how sure it is, and what its reference reads too far.
+
+    The lowest panel is there where the heading was measured. Bands are two standard deviations.
+    """
+    biased = "heading_bias" in result.shared
+    biased |= any("heading_bias" in s.slow for s in result.segments)
+    readings = [
+        _readings(segment, found.trajectory.t)
+        for segment, found in zip(result.mission.segments, result.segments, strict=True)
+    ]
+    measured = biased or any(len(t) for t, _ in readings)
+    heights = [2.0, 1.0, 1.4][: 3 if measured else 2]
+    figure = Figure(figsize=(9.0, 1.0 + 1.7 * sum(heights)), layout="constrained")
+    panels = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[
+        :, 0
+    ]
+    for i, segment in enumerate(result.segments):
+        track, colour = segment.trajectory, COLOURS[i % len(COLOURS)]
+        assert isinstance(track, PoseTrajectory)
+        angle, sigma = np.rad2deg(track.attitude[:, 0]), np.rad2deg(track.attitude_sigma[:, 0])
+        for piece in _unbroken(angle):
+            label = None if piece.start or not segment.name else segment.name
+            t, mean, sd = track.t[piece], angle[piece], sigma[piece]
+            panels[0].fill_between(t, mean - 2 * sd, mean + 2 * sd, color=colour, alpha=0.25, lw=0)
+            panels[0].plot(t, mean, color=colour, lw=1.2, label=label)
+        panels[1].plot(track.t, 2.0 * sigma, color=colour, lw=1.2)
+        if measured:
+            _draw_bias(panels[2], result, segment, readings[i], colour)
+    panels[0].set_ylabel("heading, degrees")
+    panels[0].set_ylim(-5.0, 365.0)
+    panels[0].set_yticks(range(0, 361, 90))
+    panels[1].set_ylabel("two standard\ndeviations, degrees", fontsize=8)
+    panels[1].set_ylim(0.0, 1.15 * panels[1].dataLim.y1 or 1.0)
+    if measured:
+        panels[2].set_ylabel("reading - heading,\ndegrees", fontsize=8)
+        panels[2].axhline(0.0, color=GREY, lw=0.8)
+        panels[2].legend(fontsize=8, ncols=2)
+    for axes in panels:
+        axes.grid(alpha=0.3)
+    panels[-1].set_xlabel(_time_label(result))
+    if len(result.segments) > 1:
+        panels[0].legend(fontsize=8, ncols=4)
+    figure.suptitle(f"{_title(result)}: heading, clockwise from north", fontsize=10)
+    return figure
+
+
 def slow_state(result: Result, name: str) -> Figure:
-    """A slow state over time with its one-sigma band, one panel a component."""
+    """A slow state over time with its one-sigma band, one panel a component.
+
+    What lengthens all travel times by a factor is drawn as a sound speed, or where ranges are
+    distances as the share by which these are too long.
+    """
+    table = result.residuals
+    stretched = name == "sound_speed" and table is not None and (table.kind == "slant").all()
     labels = SLOW_LABELS.get(name) or (("sound speed correction, m/s", -_mean_speed(result)),)
+    labels = (("ranges too long by, %", 100.0),) if stretched else labels
     figure = Figure(figsize=(9.0, 1.2 + 2.6 * len(labels)), layout="constrained")
     panels = figure.subplots(len(labels), 1, sharex=True, squeeze=False)[:, 0]
     for c, (axes, (label, factor)) in enumerate(zip(panels, labels, strict=True)):
         for i, segment in enumerate(result.segments):
             state = segment.slow[name]
-            value, sigma = factor * state.value[:, c], abs(factor) * state.sigma[:, c]
+            value, sigma = state.value[:, c], state.sigma[:, c]
+            if stretched:
+                value, sigma = np.expm1(value), np.exp(value) * sigma
+            value, sigma = factor * value, abs(factor) * sigma
             colour = COLOURS[i % len(COLOURS)]
             axes.fill_between(state.t, value - sigma, value + sigma, color=colour, alpha=0.25, lw=0)
             axes.plot(state.t, value, color=colour, lw=1.3, label=segment.name or None)
         axes.set_ylabel(label)
         axes.grid(alpha=0.3)
-    panels[-1].set_xlabel("time, s")
+    panels[-1].set_xlabel(_time_label(result))
     if len(result.segments) > 1:
         panels[0].legend(fontsize=8, ncols=2)
     figure.suptitle(f"{_title(result)}: estimate and one standard deviation", fontsize=10)
@@ -163,7 +228,7 @@ def errors(result: Result) -> Figure:
         axes.set_ylim(-3.0 * scale, 3.0 * scale)
         axes.axhline(0.0, color=GREY, lw=0.8)
         axes.grid(alpha=0.3)
-    panels[-1].set_xlabel("time, s")
+    panels[-1].set_xlabel(_time_label(result))
     if len(result.segments) > 1:
         panels[0].legend(fontsize=8, ncols=4)
     figure.suptitle(f"{_title(result)}: error and two standard deviations", fontsize=10)
@@ -173,6 +238,108 @@ def errors(result: Result) -> Figure:
 def _title(result: Result) -> str:
     name = result.mission.name or "mission"
     return name if result.status == "converged" else f"{name} ({result.status})"
+
+
+def _time_label(result: Result) -> str:
+    """Data without stamps count their poses instead: 0, 1, 2, ..."""
+    t = result.trajectory.t
+    poses = result.mission.options.node != "point"
+    counted = poses and np.array_equal(t, np.arange(len(t)))
+    return "t, number of the pose" if counted else "time, s"
+
+
+def _residual_limit(table: RangeResiduals, these: BoolArray) -> float:
+    """Largest residual that is drawn in its place, s."""
+    size = np.abs(table.residual)
+    kept = size[these & ~table.down_weighted].max(initial=0.0)
+    largest = float(size[these].max())
+    return 1.1 * (min(largest, FAR * float(kept)) or largest or 1e-9)
+
+
+def _draw_residuals(
+    axes: Axes, table: RangeResiduals, mine: BoolArray, factor: float, limit: float
+) -> None:
+    """Residuals of one panel times `factor`, with the axis ending at `limit`."""
+    t, residual, out = table.t_transmit, factor * table.residual, table.down_weighted
+    far = mine & (np.abs(residual) > limit)
+    kept, doubted = mine & ~out & ~far, mine & out & ~far
+    axes.plot(t[kept], residual[kept], ".", color=COLOURS[0], ms=3, label="used")
+    axes.plot(t[doubted], residual[doubted], "x", color=RED, ms=6, label="down-weighted")
+    if far.any():
+        edge = 0.97 * limit * np.sign(residual[far])
+        axes.plot(t[far], edge, "D", color=RED, ms=5, mfc="none", label="beyond the axis")
+    axes.axhline(0.0, color=GREY, lw=0.8)
+    axes.set_ylim(-limit, limit)
+    axes.grid(alpha=0.3)
+
+
+def _residual_title(
+    name: str, table: RangeResiduals, mine: BoolArray, factor: float, unit: str
+) -> str:
+    out = table.down_weighted
+    kept = factor * table.residual[mine & ~out]
+    rms = float(np.sqrt(np.mean(kept**2))) if len(kept) else 0.0
+    return (
+        f"{name}: {int(mine.sum())} pings, {int((mine & out).sum())} down-weighted, "
+        f"rms of the others {rms:.3f} {unit}"
+    )
+
+
+def _readings(segment: Segment, nodes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Times (s) and headings (rad) that a segment's references read, as the estimator saw them.
+
+    Those of a compass are its own; an attitude reference is read at the nodes.
+    """
+    t, read = np.empty(0), np.empty(0)
+    if segment.attitude is not None and len(segment.attitude):
+        track = AttitudeTrack(segment.attitude)
+        t = nodes[(nodes >= track.t[0]) & (nodes <= track.t[-1])]
+        read = mariners_angles(track.at(t))[:, 0]
+    if segment.heading is not None:
+        compass = segment.heading
+        inside = (compass.t >= nodes[0]) & (compass.t <= nodes[-1])
+        t = np.concatenate([t, compass.t[inside]])
+        read = np.concatenate([read, compass.heading[inside]])
+    some = np.unique(np.linspace(0, max(len(t) - 1, 0), MOST_READINGS).astype(int))[: len(t)]
+    return t[some], read[some]
+
+
+def _draw_bias(
+    axes: Axes,
+    result: Result,
+    segment: SegmentResult,
+    readings: tuple[FloatArray, FloatArray],
+    colour: str,
+) -> None:
+    """What the heading reference reads too far, as estimated and as its readings show it."""
+    track = segment.trajectory
+    t, read = readings
+    first = segment is result.segments[0]
+    if len(t):
+        states = track.at(t)
+        assert isinstance(states, PoseStates)
+        off = read - mariners_angles(states.rotation)[:, 0]
+        off = np.rad2deg(np.angle(np.exp(1j * off)))
+        label = "reading minus estimated heading" if first else None
+        axes.plot(t, off, ".", color=GREY, ms=3, label=label)
+    if "heading_bias" in segment.slow:
+        state = segment.slow["heading_bias"]
+        at, bias, sigma = state.t, state.value[:, 0], state.sigma[:, 0]
+    elif "heading_bias" in result.shared:
+        shared = result.shared["heading_bias"]
+        at, bias, sigma = track.t[[0, -1]], shared.value.repeat(2), shared.sigma.repeat(2)
+    else:
+        return
+    bias, band = np.rad2deg(bias), np.rad2deg(2.0 * sigma)
+    axes.fill_between(at, bias - band, bias + band, color=colour, alpha=0.25, lw=0)
+    axes.plot(at, bias, color=colour, lw=1.3, label="heading bias" if first else None)
+
+
+def _unbroken(angle: FloatArray) -> list[slice]:
+    """Pieces of an angle (degrees) within which it does not jump from 360 to 0 or back."""
+    cuts = np.flatnonzero(np.abs(np.diff(angle)) > 180.0) + 1
+    ends = [0, *cuts.tolist(), len(angle)]
+    return [slice(a, b) for a, b in pairwise(ends)]
 
 
 def _draw_reference(axes: Axes, result: Result) -> None:
@@ -188,7 +355,8 @@ def _draw_beacons(axes: Axes, result: Result) -> None:
     for i, (name, beacon) in enumerate(result.beacons.items()):
         east, north = beacon.value[:2]
         axes.plot(east, north, "^", color="black", ms=8, label=None if i else "beacon", zorder=5)
-        axes.annotate(name, (east, north), xytext=(6, 6), textcoords="offset points", fontsize=8)
+        text = axes.annotate(name, (east, north), xytext=(6, 6), textcoords="offset points")
+        text.set(fontsize=8, bbox={"fc": "white", "alpha": 0.7, "lw": 0, "pad": 1}, zorder=6)
 
 
 def _draw_ellipses(axes: Axes, segment: SegmentResult, factor: float, colour: str) -> None:

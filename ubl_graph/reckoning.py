@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ubl_graph.arrays import FloatArray
+from ubl_graph.builder import SegmentModel
 from ubl_graph.factors.odometry import Preintegration
-from ubl_graph.graph import SegmentModel
 from ubl_graph.mission import Mission
 from ubl_graph.windows import Sightings
 
@@ -16,7 +16,10 @@ class DeadReckoning:
 
     def __init__(self, mission: Mission, model: SegmentModel) -> None:
         self.mission, self.model = mission, model
-        self.odometry: Preintegration | None = model.bottom or model.water
+        # Velocities say nothing of the way where nobody knows the heading.
+        self.odometry: Preintegration | None = None
+        if model.heads:
+            self.odometry = model.bottom or model.water
         depth = model.segment.depth
         self.depth = None if depth is None or not len(depth) else depth[np.argsort(depth.t)]
         self.sightings = self._sightings()
@@ -64,6 +67,21 @@ class DeadReckoning:
                     pings.travel_time,
                     pings.sigma,
                     np.full(m, float(one_way)),
+                ]
+            )
+        slant = segment.slant_range
+        if slant is not None and len(slant):
+            # Distances as the times that they would take through this water.
+            speed = float(np.mean(self.mission.sound_speed.speed))
+            m = len(slant)
+            parts.append(
+                [
+                    np.stack([slant.t, slant.t], axis=1),
+                    np.tile([1.0, 0.0], (m, 1)),
+                    sites[self.mission.beacon_numbers(slant.beacon)],
+                    slant.distance / speed,
+                    slant.sigma / speed,
+                    np.zeros(m),
                 ]
             )
         empty = [np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 3)), *[np.empty(0)] * 3]

@@ -7,11 +7,13 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from ubl_graph.arrays import BoolArray, IntArray, frozen
+from ubl_graph.arrays import BoolArray, FloatArray, IntArray, frozen
 from ubl_graph.errors import DataError
 
 #: Times beyond this are not seconds since an epoch (they may be nanoseconds), s.
 MAX_TIME = 1e11
+#: Correlations of which the least eigenvalue is no larger are singular but for rounding.
+SINGULAR = 1e-14
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,7 @@ class Source:
     def __getitem__(self, index: Any) -> Source:
         return Source(self.file, self.row[index], self.line[index])
 
-    def error(self, index: int, field: str, problem: str, remedy: str = "") -> DataError:
+    def error(self, index: int, field: str | None, problem: str, remedy: str = "") -> DataError:
         """Build the error that names the file, row and line of record `index`."""
         return DataError(
             problem,
@@ -58,7 +60,7 @@ class Records:
 
     def __post_init__(self) -> None:
         columns = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "source"}
-        arrays = {n: np.atleast_1d(np.asarray(v)) for n, v in columns.items() if v is not None}
+        arrays = {n: _by_record(n, v) for n, v in columns.items() if v is not None}
         lengths = {len(a) for a in arrays.values()} - {1}
         if len(lengths) > 1:
             sizes = ", ".join(f"{n}: {len(a)}" for n, a in arrays.items())
@@ -121,6 +123,40 @@ class Records:
     def _check(self) -> None:
         """Check across columns; overridden where a kind has such rules."""
 
+    def _check_covariance(self, sizes: dict[int, str], remedy: str) -> None:
+        """Refuse covariances of another size, and such as are none.
+
+        Parameters
+        ----------
+        sizes : dict of int to str
+            Sizes that are right, and what each is for.
+        remedy : str
+            For a matrix that is no covariance.
+        """
+        covariance: FloatArray = getattr(self, "covariance")  # noqa: B009 - not all kinds have it
+        if covariance.shape[1:] not in [(d, d) for d in sizes]:
+            raise self.error(
+                0,
+                "covariance",
+                f"shape {covariance.shape[1:]} for {' or '.join(sizes.values())}",
+                f"give {' or '.join(f'{d} x {d}' for d in sizes)}",
+            )
+        asymmetric = np.abs(covariance - np.swapaxes(covariance, 1, 2)) > 1e-9 * np.abs(
+            covariance
+        ).max(axis=(1, 2), keepdims=True)
+        # Of the correlations: metres and radians are of no common size.
+        variances = np.diagonal(covariance, axis1=1, axis2=2)
+        sigmas = np.sqrt(np.where(variances > 0.0, variances, 1.0))
+        correlations = covariance / (sigmas[:, :, None] * sigmas[:, None, :])
+        wrong = asymmetric.any(axis=(1, 2)) | (np.linalg.eigvalsh(correlations)[:, 0] <= SINGULAR)
+        if wrong.any():
+            raise self.error(
+                int(np.argmax(wrong)),
+                "covariance",
+                "the covariance is not symmetric and positive definite",
+                remedy,
+            )
+
     @classmethod
     def unchecked(cls, **columns: Any) -> Self:
         """Make records of columns that passed the checks before; nothing is checked or copied.
@@ -139,7 +175,7 @@ class Records:
     def _source(self) -> Source | None:
         return getattr(self, "source", None)
 
-    def error(self, index: int, field: str, problem: str, remedy: str = "") -> DataError:
+    def error(self, index: int, field: str | None, problem: str, remedy: str = "") -> DataError:
         """Build the error that names record `index`, by file and row where these are known."""
         return record_error(type(self), self._source, index, field, problem, remedy)
 
@@ -165,8 +201,19 @@ class Records:
         return int(np.setdiff1d(np.arange(len(self)), first)[0])
 
 
+def _by_record(name: str, values: Any) -> Any:
+    """A column as an array of which the first axis counts records; one matrix is one for all."""
+    array = np.atleast_1d(np.asarray(values))
+    return array[None] if name == "covariance" and array.ndim == 2 else array
+
+
 def record_error(
-    kind: type[Records], source: Source | None, index: int, field: str, problem: str, remedy: str
+    kind: type[Records],
+    source: Source | None,
+    index: int,
+    field: str | None,
+    problem: str,
+    remedy: str,
 ) -> DataError:
     """Build the error that names record `index` of a kind, by file and row where these are known.
 

@@ -66,7 +66,7 @@ class RangeResiduals:
     Attributes
     ----------
     kind : array of str, shape (M,)
-        "two_way" or "one_way".
+        "two_way", "one_way" or "slant" (a distance, given as the time at 1500 m/s).
     beacon : array of str, shape (M,)
         Name of the beacon.
     t_transmit, t_receive : array, shape (M,)
@@ -116,7 +116,8 @@ class SegmentResult:
     trajectory : Trajectory
         Nodes with covariances.
     slow : dict of str to SlowState
-        `sound_speed`, `clock_offset` (s), `clock_drift`, `current` (m/s east, north).
+        `sound_speed`, `clock_offset` (s), `clock_drift`, `current` (m/s east, north),
+        `heading_bias` (rad) where it walks.
     residuals : RangeResiduals or None
         None where the segment has no ranges.
     status, reason : str
@@ -133,6 +134,9 @@ class SegmentResult:
         Weighted sum of squared whitened residuals of that problem; rows minus unknowns.
     rival : array, shape (N, 3), or None
         Positions at the nodes of another track that fits as well, where one was found.
+    runner_up : float or None
+        How much higher the cost of the next best track is that lies elsewhere: of those that were
+        solved, else of those that the search for a start compared. None where there was no other.
     """
 
     name: str
@@ -148,6 +152,7 @@ class SegmentResult:
     chi_square: float
     degrees_of_freedom: int
     rival: FloatArray | None = None
+    runner_up: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +169,9 @@ class Result:
         Every beacon; covariance zero where beacons are constants.
     shared : dict of str to Shared
         `dvl_scale`, `dvl_misalignment` (rad), `dvl_bias` (m/s), `heading_bias` (rad, what the
-        heading reference reads too far clockwise).
+        heading reference reads too far clockwise; of the nodes where it walks), `gyro_bias` (rad/s
+        read too much about forward, left, up; about up alone in the plane), `odometry_scale`,
+        `odometry_turn_bias` (rad/s turned too far clockwise).
     warnings : tuple of str
         What a user should know before trusting it.
     wall_times : dict of str to float

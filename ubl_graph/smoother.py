@@ -15,11 +15,13 @@ import numpy as np
 
 from ubl_graph.arrays import FloatArray
 from ubl_graph.assembly import assemble_segment, beacons_of, direction, shared_of
+from ubl_graph.builder import SegmentModel
 from ubl_graph.errors import SolverError
-from ubl_graph.graph import SegmentModel, build_problem, model_segment
+from ubl_graph.graph import build_problem, model_segment, shares_unknowns
 from ubl_graph.initial import START_LIMIT, Starts, find_starts
 from ubl_graph.layout import Chain
 from ubl_graph.mission import Mission
+from ubl_graph.pose_initial import find_pose_tracks
 from ubl_graph.problem import Problem
 from ubl_graph.result import DOWN_WEIGHTED, Result, SegmentResult, Shared
 from ubl_graph.solve.choice import Choice, choose
@@ -83,8 +85,7 @@ def smooth(mission: Mission, progress: Progress | None = None) -> Result:
     _judge_profile(work)
     with work.stage("model"):
         models = [model_segment(segment, mission.options) for segment in mission.segments]
-    shared_unknowns = mission.options.estimate_beacons or any(m.bottom or m.water for m in models)
-    groups = [models] if shared_unknowns else [[model] for model in models]
+    groups = [models] if shares_unknowns(mission, models) else [[model] for model in models]
     segments: list[SegmentResult] = []
     shared: dict[str, Shared] = {}
     for number, group in enumerate(groups):
@@ -139,9 +140,11 @@ def _judge(work: _Work, segment: SegmentResult) -> None:
     if residuals is not None:
         share = float(residuals.down_weighted.mean())
         if share > SUSPICIOUS_SHARE:
+            # Distances know no sound speed; whoever measured them may have taken a wrong one.
+            scale = "the ranges' scale" if (residuals.kind == "slant").all() else "sound speed"
             work.warn(
                 segment.name,
-                f"{100 * share:.0f} % of the pings are down-weighted; check beacons, sound speed, "
+                f"{100 * share:.0f} % of the pings are down-weighted; check beacons, {scale}, "
                 "sigmas and the start before trusting this track",
             )
         blind = int((~residuals.found).sum())
@@ -173,13 +176,26 @@ def _smooth_group(
     with work.stage("covariance"):
         marginals = Marginals(problem, solution)
         results: list[SegmentResult] = []
-        for chain, model in zip(problem.layout.chains, group, strict=True):
-            rival, track = _rival(problem, solution, marginals, rivals, chain)
+        by_model = zip(group, (starts for _, starts in searched), strict=True)
+        for chain, (model, starts) in zip(problem.layout.chains, by_model, strict=True):
+            rival, track, runner_up = _rival(problem, solution, marginals, rivals, chain)
+            if runner_up is None:
+                runner_up = starts.runner_up
             if len(group) == 1:
                 rival = unanchored(model) or rival
             results.append(
                 assemble_segment(
-                    problem, solution, marginals, chain, model, rival, track, number, solver
+                    problem,
+                    solution,
+                    marginals,
+                    chain,
+                    model,
+                    rival,
+                    track,
+                    number,
+                    solver,
+                    runner_up,
+                    work.mission.options,
                 )
             )
         return results, shared_of(problem, solution, marginals)
@@ -199,7 +215,8 @@ def _solved(
 
 def _search(work: _Work, model: SegmentModel) -> tuple[SegmentModel, Starts]:
     """Find a segment's start; a start prior that all pings contradict is left out, and said."""
-    starts = find_starts(work.mission, model)
+    find = find_starts if work.mission.options.node == "point" else find_pose_tracks
+    starts = find(work.mission, model)
     if starts.start_sigmas is None or starts.start_sigmas < START_LIMIT:
         return model, starts
     work.warn(
@@ -208,7 +225,7 @@ def _search(work: _Work, model: SegmentModel) -> tuple[SegmentModel, Starts]:
         "vehicle; it was left out",
     )
     model = replace(model, segment=replace(model.segment, start=None))
-    return model, find_starts(work.mission, model)
+    return model, find(work.mission, model)
 
 
 def _solve_from(
@@ -277,26 +294,32 @@ def _rival(
     marginals: Marginals,
     others: Sequence[Solution],
     chain: Chain,
-) -> tuple[str | None, FloatArray | None]:
+) -> tuple[str | None, FloatArray | None, float | None]:
     """Another track of a segment that fits as well and that the covariance does not cover.
 
-    Returns what to say of it, and its positions at all nodes.
+    Returns what to say of it, its positions at all nodes, and how much dearer the next best track
+    elsewhere is, whether or not it fits as well.
     """
+    runner_up: float | None = None
     sigma = np.sqrt(np.linalg.eigvalsh(marginals.of("position")[chain.nodes])[:, -1])
     covered = max(1.0, COVERED_SIGMAS * float(np.sqrt(np.mean(sigma**2))))
     for other in others:
-        here, there = (problem.layout.get(s.x, "position")[chain.nodes] for s in (best, other))
+        here, there = (problem.layout.positions(s.x)[chain.nodes] for s in (best, other))
         gap = here - there
         apart = float(np.sqrt(np.mean(np.sum(gap**2, axis=1))))
         extra = max(other.cost - best.cost, 0.0)
-        if apart > covered and extra < AMBIGUOUS_COST:
-            return (
-                f"ambiguous: another track, {apart:.0f} m away (rms, mostly "
-                f"{direction(np.linalg.eigh(gap.T @ gap)[1][:, -1])}), fits as well (its cost is "
-                f"{extra:.2g} higher); a start, a fix, a turn or a second beacon off the line "
-                "would tell"
-            ), problem.layout.get(other.x, "position")
-    return None, None
+        if apart <= covered:
+            continue
+        runner_up = extra if runner_up is None else runner_up
+        if extra < AMBIGUOUS_COST:
+            along = direction(np.linalg.eigh(gap.T @ gap)[1][:, -1])
+            text = (
+                f"ambiguous: another track, {apart:.0f} m away (rms, mostly {along}), fits as well "
+                f"(its cost is {extra:.2g} higher); a start, a fix, a turn or a second beacon off "
+                "the line would tell"
+            )
+            return text, problem.layout.positions(other.x), runner_up
+    return None, None, runner_up
 
 
 @dataclass

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
 
+from ubl_graph import lie
 from ubl_graph.arrays import FloatArray
-from ubl_graph.graph import SegmentModel
+from ubl_graph.builder import SegmentModel
+from ubl_graph.factors.poses import PoseNodes
 from ubl_graph.layout import Chain, Layout
 from ubl_graph.mission import Mission, Segment
 from ubl_graph.trajectory import Trajectory
@@ -31,6 +34,10 @@ class Track:
         Log scale of the travel times, clock offset (s).
     cost : float
         Of the way through the windows.
+    rotation : array, shape (N, 3, 3), optional
+        `world_R_body` at the nodes; poses have one.
+    errors : dict of str to float
+        Of the odometry, as far as the search found them; states by the name of what is shared.
     """
 
     position: FloatArray
@@ -39,21 +46,58 @@ class Track:
     scale: FloatArray
     clock: FloatArray
     cost: float
+    rotation: FloatArray | None = None
+    errors: dict[str, float] = field(default_factory=dict[str, float])
 
 
 def place(layout: Layout, chain: Chain, track: Track, x: FloatArray) -> None:
     """Write a track into the flat vector `x`, in place."""
     nodes = chain.first + np.arange(len(chain.t))
-    values = {
+    values: dict[str, FloatArray] = {
         "position": track.position,
         "velocity": track.velocity,
         "acceleration": track.acceleration,
         "sound_speed": track.scale[:, None],
         "clock_offset": track.clock[:, None],
     }
+    if layout.node != "point":
+        values |= _pose_values(layout, chain, track)
     for name, value in values.items():
         if layout.has(name):
             x[layout.node_columns(name, nodes)] = value / layout.unit(name)
+
+
+def _pose_values(layout: Layout, chain: Chain, track: Track) -> dict[str, FloatArray]:
+    """What pose nodes hold of a track: places, rotations, and velocities in the body's axes."""
+    rotation = track.rotation
+    if rotation is None:
+        rotation = along_course(track.velocity)
+    vector = lie.rotation_vector(rotation)
+    velocity = np.einsum("nji,nj->ni", rotation, track.velocity)
+    rate = np.zeros_like(velocity)
+    if len(chain.t) > 1:
+        turns = lie.rotation_vector(np.swapaxes(rotation[:-1], 1, 2) @ rotation[1:])
+        rate[:-1] = turns / np.diff(chain.t)[:, None]
+        rate[-1] = rate[-2]
+    if layout.node == "pose2":
+        return {
+            "position": track.position[:, :2],
+            "rotation": np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])[:, None],
+            "velocity": velocity[:, :2],
+            "rate": rate[:, 2:],
+        }
+    return {"rotation": vector, "velocity": velocity, "rate": rate}
+
+
+def along_course(velocity: FloatArray) -> FloatArray:
+    """Level rotations with the bow along the course of velocities (N, 3); east where there is none.
+
+    Returns
+    -------
+    array, shape (N, 3, 3)
+    """
+    yaw = np.arctan2(velocity[:, 1], velocity[:, 0])
+    return lie.rotation(yaw[:, None] * np.array([0.0, 0.0, 1.0]))
 
 
 def track_of(layout: Layout, chain: Chain, x: FloatArray) -> Track:
@@ -64,13 +108,20 @@ def track_of(layout: Layout, chain: Chain, x: FloatArray) -> Track:
             return layout.get(x, name)[chain.nodes]
         return np.zeros((len(chain.t), width))
 
+    rotation = None
+    velocity = read("velocity", 3)
+    if layout.node != "point":
+        nodes = PoseNodes(layout, chain.first + np.arange(len(chain.t))).at(x)
+        rotation = nodes.rotation
+        velocity = np.einsum("nij,nj->ni", rotation, nodes.twist[:, :3])
     return Track(
-        read("position", 3),
-        read("velocity", 3),
+        layout.positions(x)[chain.nodes],
+        velocity,
         read("acceleration", 3),
         read("sound_speed", 1)[:, 0],
         read("clock_offset", 1)[:, 0],
         0.0,
+        rotation,
     )
 
 
@@ -79,6 +130,9 @@ def start_vector(mission: Mission, layout: Layout, tracks: Sequence[Track]) -> F
     x = np.zeros(layout.size)
     for chain, track in zip(layout.chains, tracks, strict=True):
         place(layout, chain, track, x)
+        for name, value in track.errors.items():
+            if name in dict(layout.shared):
+                layout.put(x, name, np.array([value]))
     for beacon in mission.beacons:
         if layout.has(f"beacon {beacon.name}"):
             layout.put(x, f"beacon {beacon.name}", beacon.position)
@@ -114,7 +168,15 @@ def _resampled(track: Track, old: FloatArray, new: FloatArray) -> Track:
         acceleration=np.stack([np.interp(new, old, a) for a in track.acceleration.T], axis=1),
         scale=np.interp(new, old, track.scale),
         clock=np.interp(new, old, track.clock),
+        rotation=None if track.rotation is None else _turned_over(track.rotation, old, new),
     )
+
+
+def _turned_over(rotation: FloatArray, old: FloatArray, new: FloatArray) -> FloatArray:
+    """Rotations at other times."""
+    if len(old) == 1:
+        return np.repeat(rotation, len(new), axis=0)
+    return Slerp(old, Rotation.from_matrix(rotation))(np.clip(new, old[0], old[-1])).as_matrix()
 
 
 def mirror_images(mission: Mission, model: SegmentModel, track: Track) -> list[Track]:
@@ -158,10 +220,20 @@ def unanchored(model: SegmentModel) -> str | None:
     odometry, which knows the heading, one known point still leaves the mirror image; two do not.
     """
     segment = model.segment
-    if _lone_beacon(model) is None or _has_odometry(model):
+    steps = segment.odometry is not None and len(segment.odometry) > 0
+    if _lone_beacon(model) is None or _has_odometry(model) or (steps and model.heads):
         return None
     fixes = 0 if segment.position is None else len(segment.position)
     anchors = fixes + (segment.start is not None)
+    if steps or (model.gyro is not None and (model.bottom or model.water)):
+        # It knows its own turns: nothing can be mirrored, and any known point will do.
+        if anchors:
+            return None
+        return (
+            "ambiguous: one beacon was heard and nothing tells the heading, so the whole track can "
+            "be turned about the beacon without changing a range; a start, a compass, a fix or a "
+            "second beacon would tell"
+        )
     if anchors >= 2:
         return None
     turned = "be turned about the beacon"
@@ -176,13 +248,14 @@ def unanchored(model: SegmentModel) -> str | None:
 def _lone_beacon(model: SegmentModel) -> str | None:
     """Name of the only beacon heard, None where there are others or none."""
     segment = model.segment
-    ranges = [r for r in (segment.two_way_range, segment.one_way_range) if r is not None]
+    kinds = (segment.two_way_range, segment.one_way_range, segment.slant_range)
+    ranges = [r for r in kinds if r is not None]
     heard = {str(name) for r in ranges for name in r.beacon}
     return heard.pop() if len(heard) == 1 else None
 
 
 def _has_odometry(model: SegmentModel) -> bool:
-    return model.bottom is not None or model.water is not None
+    return model.heads and (model.bottom is not None or model.water is not None)
 
 
 def _is_conceivable(segment: Segment, track: Track, image: Track) -> bool:
@@ -210,8 +283,16 @@ def _reflected(track: Track, point: FloatArray, axis: FloatArray) -> Track:
     mirror = np.eye(3)
     mirror[:2, :2] = 2.0 * np.outer(unit, unit) - np.eye(2)
     centre = np.array([*point, 0.0])
+    rotation = track.rotation
+    if rotation is not None:
+        # The bow is mirrored; the vehicle cannot be.
+        bow = rotation[:, :, 0]
+        after = bow @ mirror
+        turn = np.arctan2(after[:, 1], after[:, 0]) - np.arctan2(bow[:, 1], bow[:, 0])
+        rotation = lie.rotation(turn[:, None] * np.array([0.0, 0.0, 1.0])) @ rotation
     return replace(
         track,
+        rotation=rotation,
         position=(track.position - centre) @ mirror + centre,
         velocity=track.velocity @ mirror,
         acceleration=track.acceleration @ mirror,

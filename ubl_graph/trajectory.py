@@ -266,6 +266,21 @@ class Trajectory:
         TimeError
             Where a time is not finite or outside the span, or `times` has two dimensions.
         """
+        times = self.checked(times)
+        k, dt, s = locate(self.t, times)
+        position = self._mean(k, dt, s, 0)
+        velocity = self._mean(k, dt, s, 1)
+        covariance = [self._spread(k, dt, s, 0), self._spread(k, dt, s, 1)]
+        return States(times, position, velocity, *covariance)
+
+    def checked(self, times: ArrayLike) -> FloatArray:
+        """Times as an array (M,), all of them within the span.
+
+        Raises
+        ------
+        TimeError
+            As `at` does.
+        """
         times = np.atleast_1d(np.asarray(times, dtype=np.float64))
         if times.ndim != 1:
             raise TimeError(f"times have {times.ndim} dimensions; give one time or a list of them")
@@ -275,11 +290,7 @@ class Trajectory:
                 f"t = {times[np.argmax(outside)]} s is outside the trajectory, "
                 f"{self.t[0]} to {self.t[-1]} s"
             )
-        k, dt, s = locate(self.t, times)
-        position = self._mean(k, dt, s, 0)
-        velocity = self._mean(k, dt, s, 1)
-        covariance = [self._spread(k, dt, s, 0), self._spread(k, dt, s, 1)]
-        return States(times, position, velocity, *covariance)
+        return times
 
     def _spread(
         self, k: IntArray, dt: FloatArray, s: FloatArray, derivative: Literal[0, 1]

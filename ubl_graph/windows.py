@@ -19,6 +19,7 @@ import numpy as np
 
 from ubl_graph.acoustics import SoundSpeedProfile, straight
 from ubl_graph.arrays import BoolArray, FloatArray, IntArray, frozen
+from ubl_graph.factors.loss import WIDTHS
 
 #: Columns of a fit's parameters.
 EAST_NORTH_UP, VELOCITY, ACCELERATION = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -35,7 +36,7 @@ KEPT = 6
 #: and more of them where so little tells them apart (one beacon and no heading: a whole circle).
 VALLEY_COST, MOST_KEPT = 10.0, 48
 #: Cauchy width, in sigmas, of the windows' residuals.
-WIDTH = 2.3849
+WIDTH = WIDTHS["cauchy"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,6 +36,14 @@ class Block(Protocol):
         """Whether the problem's robust loss applies (then R = 1)."""
         ...
 
+    @property
+    def log_det(self) -> Callable[[], float] | None:
+        """Gives the sum over the rows of the logarithm of what whitens them (its determinant).
+
+        None where that is constant, or `frozen` says it.
+        """
+        ...
+
     def frozen(self, x: FloatArray) -> FloatArray | None:
         """What is held fixed while a solve runs, taken at `x` (a standard deviation per row)."""
         ...

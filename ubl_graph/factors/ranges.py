@@ -14,7 +14,7 @@ states is the layout's business (`Interpolation`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -27,11 +27,36 @@ from ubl_graph.layout import Interpolation
 TravelTimeModel = Callable[[FloatArray, FloatArray], TravelTimes]
 
 
-@dataclass(frozen=True, eq=False)
-class Legs:
-    """The legs of M pings, L each, as the residual needs them.
+class Antenna(Protocol):
+    """Where the transducer is at each of the L legs of M pings, and how that moves with x."""
 
-    Attributes
+    @property
+    def columns(self) -> IntArray:
+        """Columns of the flat vector that the legs of each ping touch, shape (M, W); -1 pads."""
+        ...
+
+    @property
+    def legs(self) -> int:
+        """Legs L of a ping."""
+        ...
+
+    def positions(self, x: FloatArray, rows: slice) -> tuple[FloatArray, Any]:
+        """Positions (m, L, 3) of the pings `rows` at `x`, m, and what `slopes` needs of them."""
+        ...
+
+    def slopes(self, gradient: FloatArray, terms: Any, rows: slice) -> FloatArray:
+        """Derivatives (m, W) of a sum over the legs, given those by the positions (m, L, 3)."""
+        ...
+
+    def variance(self, gradient: FloatArray, terms: Any) -> FloatArray:
+        """What the motion between the nodes adds to the sum's variance, (M,)."""
+        ...
+
+
+class PointAntenna:
+    """Transducer on point nodes, whose attitude is held.
+
+    Parameters
     ----------
     position : Interpolation
         Of the reference point at each leg's time, rows ping after ping (M * L).
@@ -43,10 +68,35 @@ class Legs:
         Interpolation variance at unit density (`trajectory.interpolation_variance`).
     """
 
-    position: Interpolation
-    lever: FloatArray
-    psd: FloatArray
-    variance_factor: FloatArray
+    def __init__(
+        self,
+        position: Interpolation,
+        lever: FloatArray,
+        psd: FloatArray,
+        variance_factor: FloatArray,
+    ) -> None:
+        m, self.legs = lever.shape[:2]
+        self._columns, self._weights = by_leg(position, m, self.legs)
+        self._lever = lever
+        self._variance = variance_factor.reshape(m, self.legs, 1) * psd
+        self.columns = self._columns.reshape(m, -1)
+
+    def positions(self, x: FloatArray, rows: slice) -> tuple[FloatArray, None]:
+        """Positions (m, L, 3) at `x`, m."""
+        columns, weights = self._columns[rows], self._weights[rows]
+        return (x[columns] * weights[..., None]).sum(axis=2) + self._lever[rows], None
+
+    def slopes(self, gradient: FloatArray, terms: None, rows: slice) -> FloatArray:  # noqa: ARG002 - the protocol's form
+        """Derivatives (m, W) by the columns, given those by the positions (m, L, 3)."""
+        return (gradient[:, :, None, :] * self._weights[rows][..., None]).reshape(len(gradient), -1)
+
+    def variance(self, gradient: FloatArray, terms: None) -> FloatArray:  # noqa: ARG002 - the protocol's form
+        """Variance of the motion between the nodes along the gradients, (M,).
+
+        The legs of one ping count as independent: they lie in different intervals, or the interval
+        is so short that the term vanishes.
+        """
+        return (gradient**2 * self._variance).sum(axis=(1, 2))
 
 
 class RangeBlock:
@@ -55,13 +105,13 @@ class RangeBlock:
     Parameters
     ----------
     name : str
-        "two_way_range" or "one_way_range".
+        "two_way_range", "one_way_range" or "slant_range".
     chain : str
         Name of the chain whose pings they are.
     model : callable
         Acoustic times and gradients of (N, 3) antenna and (N, 3) beacon positions.
-    legs : Legs
-        Antenna positions.
+    antenna : Antenna
+        Where the transducer is at each leg's time.
     beacons : array, shape (M, 3)
         Beacon positions, ENU m; where beacons are estimated, only their starting values.
     measured : array, shape (M,)
@@ -78,13 +128,14 @@ class RangeBlock:
 
     linear = False
     robust = True
+    log_det = None
 
     def __init__(
         self,
         name: str,
         chain: str,
         model: TravelTimeModel,
-        legs: Legs,
+        antenna: Antenna,
         beacons: FloatArray,
         measured: FloatArray,
         sigma: FloatArray,
@@ -97,15 +148,13 @@ class RangeBlock:
         self.model = model
         self.measured = measured
         self.sigma = sigma
-        self.legs = legs
-        m, n_legs = legs.lever.shape[:2]
-        self._lever = legs.lever
-        self._position = _by_leg(legs.position, m, n_legs)
-        self._sound_speed = None if sound_speed is None else _by_leg(sound_speed, m, n_legs)
-        self._clock = None if clock is None else _by_leg(clock, m, 1)
+        self.antenna = antenna
+        m, n_legs = len(measured), antenna.legs
+        self._sound_speed = None if sound_speed is None else by_leg(sound_speed, m, n_legs)
+        self._clock = None if clock is None else by_leg(clock, m, 1)
         self._beacons = np.repeat(beacons[:, None, :], n_legs, axis=1)
         self._beacon_columns = beacon_columns
-        parts = [self._position[0].reshape(m, -1)]
+        parts = [antenna.columns]
         slow = (self._sound_speed, self._clock)
         parts += [part[0].reshape(m, -1) for part in slow if part is not None]
         if beacon_columns is not None:
@@ -119,17 +168,15 @@ class RangeBlock:
         """Standard deviation of each row (M,), s: the measurement's and the interpolation's.
 
         The variance of the trajectory between its nodes is projected on the legs' directions at
-        `x`. The legs of one ping count as independent: they lie in different intervals, or the
-        interval is so short that the term vanishes.
+        `x`.
         """
-        slopes = self._model_terms(x, ALL_ROWS)[2]
-        variance = self.legs.variance_factor.reshape(slopes.shape[:2])[..., None] * self.legs.psd
-        return np.sqrt(self.sigma**2 + (slopes**2 * variance).sum(axis=(1, 2)))
+        terms = self._model_terms(x, ALL_ROWS)
+        return np.sqrt(self.sigma**2 + self.antenna.variance(terms.slopes, terms.antenna))
 
     def found(self, x: FloatArray) -> BoolArray:
         """Whether a direct ray exists for all legs of each ping, (M,)."""
-        total, _, _, _, travel = self._model_terms(x, ALL_ROWS)
-        return np.all(travel.found.reshape(len(total), -1), axis=1)
+        found = self._model_terms(x, ALL_ROWS).travel.found
+        return np.all(found.reshape(len(self), -1), axis=1)
 
     def evaluate(
         self,
@@ -140,29 +187,24 @@ class RangeBlock:
     ) -> tuple[FloatArray, FloatArray | None]:
         """Whitened residuals (m, 1) of `rows` at `x` and Jacobians (m, 1, C)."""
         sigma = (self.sigma if frozen is None else frozen)[rows]
-        total, times, slopes, scale, travel = self._model_terms(x, rows)
-        residual = ((total - self.measured[rows]) / sigma)[:, None]
+        terms = self._model_terms(x, rows)
+        residual = ((terms.total - self.measured[rows]) / sigma)[:, None]
         if not jacobian:
             return residual, None
-        m = len(total)
-        weights = self._position[1][rows]
-        parts = [(slopes[:, :, None, :] * weights[..., None]).reshape(m, -1)]
+        m = len(terms.total)
+        parts = [self.antenna.slopes(terms.slopes, terms.antenna, rows)]
         if self._sound_speed is not None:
-            parts.append((times[..., None] * self._sound_speed[1][rows]).reshape(m, -1))
+            parts.append((terms.times[..., None] * self._sound_speed[1][rows]).reshape(m, -1))
         if self._clock is not None:
             parts.append(self._clock[1][rows].reshape(m, -1))
         if self._beacon_columns is not None:
-            back = travel.gradient_b.reshape(slopes.shape)
-            parts.append((back * scale[..., None]).sum(axis=1))
+            back = terms.travel.gradient_b.reshape(terms.slopes.shape)
+            parts.append((back * terms.scale[..., None]).sum(axis=1))
         jacobians = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
         return residual, (jacobians / sigma[:, None])[:, None, :]
 
-    def _model_terms(
-        self, x: FloatArray, rows: slice
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, TravelTimes]:
-        """Total time (m,), times by leg (m, L), their gradients (m, L, 3), scale, raw times."""
-        columns, weights = self._position[0][rows], self._position[1][rows]
-        antenna = (x[columns] * weights[..., None]).sum(axis=2) + self._lever[rows]
+    def _model_terms(self, x: FloatArray, rows: slice) -> _Terms:
+        antenna, held = self.antenna.positions(x, rows)
         m, n_legs = antenna.shape[:2]
         if self._beacon_columns is None:
             beacon = self._beacons[rows]
@@ -181,10 +223,21 @@ class RangeBlock:
         if self._clock is not None:
             columns, weights = self._clock[0][rows], self._clock[1][rows]
             total = total + (x[columns[..., 0]] * weights).sum(axis=(1, 2))
-        return total, times, slopes, scale, travel
+        return _Terms(total, times, slopes, scale, travel, held)
 
 
-def _by_leg(part: Interpolation, m: int, n_legs: int) -> tuple[IntArray, FloatArray]:
+class _Terms(NamedTuple):
+    """What a residual is made of: sums, legs, and what the antenna remembers of its positions."""
+
+    total: FloatArray  # (m,), s
+    times: FloatArray  # (m, L), s
+    slopes: FloatArray  # (m, L, 3), s/m
+    scale: FloatArray  # (m, L)
+    travel: TravelTimes
+    antenna: Any
+
+
+def by_leg(part: Interpolation, m: int, n_legs: int) -> tuple[IntArray, FloatArray]:
     """Columns (M, L, W, D) and weights (M, L, W). Padding stays -1: its weight is zero."""
     part = part.compact()
     width = part.weights.shape[1]

@@ -6,6 +6,7 @@ not go together) the mission's own classes check; their errors are made to name 
 
 from __future__ import annotations
 
+import math
 import re
 import tomllib
 from collections.abc import Callable
@@ -27,12 +28,17 @@ from ubl_graph.io.mission_schema import (
     LeverArmTable,
     NamedTable,
     OriginTable,
+    PyfgDocument,
     SoundSpeedTable,
+    StartTable,
     VehicleTable,
     validated,
 )
+from ubl_graph.io.pyfg import read_pyfg
+from ubl_graph.io.pyfg_mission import PYFG_OPTIONS, pyfg_beacons, pyfg_node, pyfg_segments
 from ubl_graph.io.tables import naming, read_text
 from ubl_graph.mission import RECORD_KINDS, Mission, Segment, Setup, Start, Vehicle
+from ubl_graph.mission_checks import RANGE_KINDS
 from ubl_graph.options import Options
 from ubl_graph.records import Records
 
@@ -61,6 +67,8 @@ def load_mission(path: str | Path) -> Mission:
     document = validated(_parsed(path), path)
     if isinstance(document, GarposDocument):
         return _garpos_mission(document, path)
+    if isinstance(document, PyfgDocument):
+        return _pyfg_mission(document, path)
     return _csv_mission(document, path)
 
 
@@ -147,6 +155,31 @@ def _garpos_mission(document: GarposDocument, path: Path) -> Mission:
         )
 
 
+def _pyfg_mission(document: PyfgDocument, path: Path) -> Mission:
+    graph = read_pyfg(path.parent / document.data.file)
+    node, given = pyfg_node(graph), document.options.given()
+    if given.get("node", node) != node:
+        raise ConfigurationError(
+            f"'{given['node']}' does not go with the poses of {graph.file}, which are of {node}",
+            "leave node out: it is taken from the file",
+            file=path,
+            field="options.node",
+        )
+    chosen: dict[str, Any] = {**PYFG_OPTIONS, "node": node, **given}
+    with naming(path, "options."):
+        options = Options(**chosen)
+    with naming(path):
+        return Mission(
+            segments=pyfg_segments(graph, _start(document.start, path)),
+            beacons=pyfg_beacons(graph, options.estimate_beacons),
+            sound_speed=_sound_speed(None, path),
+            vehicle=_vehicle(document.vehicle, path),
+            options=options,
+            name=_name(document.mission, path),
+            origin=_origin(document.mission.origin, path),
+        )
+
+
 def _csv_mission(document: CsvDocument, path: Path) -> Mission:
     _check_data(document, path)
     parts = _parts(document, path)
@@ -162,14 +195,12 @@ def _parts(document: CsvDocument, path: Path) -> dict[str, Any]:
     beacons = tuple(_beacon(table, origin, path) for table in document.beacon)
     with naming(path, "options."):
         options = Options(**document.options.given())
-    with naming(path, "start."):
-        start = Start(**document.start.given()) if document.start else None
     return {
         "beacons": beacons,
         "sound_speed": _sound_speed(document.sound_speed, path),
         "vehicle": _vehicle(document.vehicle, path),
         "options": options,
-        "start": start,
+        "start": _start(document.start, path),
         "name": _name(document.mission, path),
         "origin": origin,
     }
@@ -178,7 +209,8 @@ def _parts(document: CsvDocument, path: Path) -> dict[str, Any]:
 def _check_data(document: CsvDocument, path: Path) -> None:
     """Refuse a mission that lacks a part, before any file is read."""
     given = document.data.given().keys() & RECORD_KINDS.keys()
-    ranges = bool(given & {"two_way_range", "one_way_range"})
+    ranges = bool(given & set(RANGE_KINDS))
+    timed = bool(given & set(RANGE_KINDS) - {"slant_range"})
     if not given:
         raise ConfigurationError(
             "no data file is named", f"known: {', '.join(RECORD_KINDS)}", file=path, field="data"
@@ -190,7 +222,7 @@ def _check_data(document: CsvDocument, path: Path) -> None:
             file=path,
             field="beacon",
         )
-    _check_sound_speed(document, path, needed=ranges, why="ranges are given")
+    _check_sound_speed(document, path, needed=timed, why="ranges are given")
 
 
 def _check_sound_speed(document: CsvDocument, path: Path, *, needed: bool, why: str) -> None:
@@ -214,8 +246,12 @@ def _read_records(
     readers: dict[str, Callable[[Path], Records]] = {
         "two_way_range": lambda file: records.read_two_way_range(file, beacons, sigma),
         "one_way_range": lambda file: records.read_one_way_range(file, sigma),
+        "slant_range": records.read_slant_range,
         "velocity": records.read_velocity,
         "attitude": records.read_attitude,
+        "heading": records.read_heading,
+        "angular_rate": records.read_angular_rate,
+        "odometry": records.read_odometry,
         "depth": records.read_depth,
         "position": lambda file: records.read_position(file, origin),
     }
@@ -261,7 +297,7 @@ def _position(given: dict[str, float], origin: GeodeticOrigin | None) -> FloatAr
 
 
 def _sound_speed(table: SoundSpeedTable | None, path: Path) -> SoundSpeedProfile:
-    if table is None:  # no ranges: never used
+    if table is None:  # no travel times: never used
         return SoundSpeedProfile.constant(1500.0)
     if (table.constant is None) == (table.profile is None):
         raise ConfigurationError(
@@ -271,6 +307,27 @@ def _sound_speed(table: SoundSpeedTable | None, path: Path) -> SoundSpeedProfile
         return records.read_sound_speed(path.parent / table.profile)
     with naming(path, "sound_speed.", columns={"speed": "constant"}):
         return SoundSpeedProfile.constant(table.constant or 0.0)
+
+
+def _start(table: StartTable | None, path: Path) -> Start | None:
+    if table is None:
+        return None
+    given = table.given()
+    angles = {"heading": "heading_deg", "heading_sigma": "heading_sigma_deg"}
+    with naming(path, "start."):
+        if "heading_sigma_deg" in given and "heading_deg" not in given:
+            raise ConfigurationError(
+                "a sigma of no heading", "give heading_deg too", field="heading_sigma_deg"
+            )
+        for key, high, low in (("heading_deg", 720.0, -720.0), ("heading_sigma_deg", 180.0, 1e-6)):
+            if key in given and not low <= given[key] <= high:
+                raise ConfigurationError(
+                    f"{given[key]} degrees is outside {low:g} to {high:g} degrees", field=key
+                )
+        for name, key in angles.items():
+            if key in given:
+                given[name] = math.radians(given.pop(key))
+        return Start(**given)
 
 
 def _vehicle(table: VehicleTable, path: Path) -> Vehicle:

@@ -115,13 +115,15 @@ class VehicleTable(Table):
 
 
 class StartTable(Table):
-    """[start]: seconds and metres."""
+    """[start]: seconds and metres; degrees where the key says so."""
 
     t: float
     east: float
     north: float
     up: float | None = None
     sigma: float | None = None
+    heading_deg: float | None = None
+    heading_sigma_deg: float | None = None
 
 
 class CsvDataTable(Table):
@@ -130,8 +132,12 @@ class CsvDataTable(Table):
     format: Literal["csv"] = "csv"
     two_way_range: str | None = None
     one_way_range: str | None = None
+    slant_range: str | None = None
     velocity: str | None = None
     attitude: str | None = None
+    heading: str | None = None
+    angular_rate: str | None = None
+    odometry: str | None = None
     depth: str | None = None
     position: str | None = None
 
@@ -145,6 +151,13 @@ class GarposDataTable(Table):
     sound_speed: Annotated[Any, BeforeValidator(_number_or_file)]
     beacons: str | None = None
     lines: Annotated[list[str], Field(min_length=1)] | None = None
+
+
+class PyfgDataTable(Table):
+    """[data] in a PyFG file: its name."""
+
+    format: Literal["pyfg"]
+    file: str
 
 
 def _options_model() -> Any:
@@ -177,13 +190,26 @@ class GarposDocument(Table):
     data: GarposDataTable
 
 
-_FORMATS: dict[str, type[CsvDocument | GarposDocument]] = {
+class PyfgDocument(Table):
+    """A mission file with beacons and data in a PyFG file."""
+
+    mission: MissionTable = MissionTable()
+    vehicle: VehicleTable = VehicleTable()
+    start: StartTable | None = None
+    options: _Options = _Options()  # pyright: ignore[reportInvalidTypeForm]
+    data: PyfgDataTable
+
+
+Document = CsvDocument | GarposDocument | PyfgDocument
+
+_FORMATS: dict[str, type[Document]] = {
     "csv": CsvDocument,
     "garpos": GarposDocument,
+    "pyfg": PyfgDocument,
 }
 
 
-def validated(content: dict[str, Any], path: Path) -> CsvDocument | GarposDocument:
+def validated(content: dict[str, Any], path: Path) -> Document:
     """Check the content of a mission file against the format that its [data] names.
 
     Parameters
@@ -195,7 +221,7 @@ def validated(content: dict[str, Any], path: Path) -> CsvDocument | GarposDocume
 
     Returns
     -------
-    CsvDocument or GarposDocument
+    CsvDocument, GarposDocument or PyfgDocument
 
     Raises
     ------

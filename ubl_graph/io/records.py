@@ -1,17 +1,16 @@
 """From CSV files to measurement records and sound-speed profiles.
 
-`LAYOUTS` says which columns each kind of file has. A column bears the name of the record's field
-and holds SI units, but for angles, which files give in degrees. Rows may stand in any order of
-time. Columns of other names are ignored, unless one looks like a slip for an optional column that
-is missing: then the file is refused, since a silently ignored ``sgima`` is a wrong result.
+Module `columns` says which columns each kind of file has. A column bears the name of the record's
+field and holds SI units, but for angles, which files give in degrees. Rows may stand in any order
+of time. Columns of other names are ignored, unless one looks like a slip for an optional column
+that is missing: then the file is refused, since a silently ignored ``sgima`` is a wrong result.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -19,59 +18,31 @@ from ubl_graph.acoustics import SoundSpeedProfile
 from ubl_graph.acoustics.profile import FASTEST, SLOWEST
 from ubl_graph.arrays import FloatArray
 from ubl_graph.beacon import Beacon
-from ubl_graph.errors import ConfigurationError, DataError
+from ubl_graph.errors import ConfigurationError
 from ubl_graph.frames import GeodeticOrigin
-from ubl_graph.io.tables import Table, did_you_mean, naming, nearest, read_table
+from ubl_graph.io.columns import (
+    COVARIANCE,
+    VERTICAL_COVARIANCE,
+    bounded,
+    degrees,
+    opened,
+    records_of,
+)
+from ubl_graph.io.tables import Table, did_you_mean, naming, read_table
 from ubl_graph.measurements import (
     TRAVEL_TIME_SIGMA,
+    AngularRate,
     Attitude,
     Depth,
+    Heading,
+    Odometry,
     OneWayRange,
     PositionFix,
+    SlantRange,
     TwoWayRange,
     Velocity,
+    odometry_covariance,
 )
-from ubl_graph.records import Records
-
-HORIZONTAL_COVARIANCE = ("cov_east_east", "cov_east_north", "cov_north_north")
-VERTICAL_COVARIANCE = ("cov_east_up", "cov_north_up", "cov_up_up")
-_COVARIANCE = (*HORIZONTAL_COVARIANCE, *VERTICAL_COVARIANCE)
-
-AnyRecords = TypeVar("AnyRecords", bound=Records)
-
-
-@dataclass(frozen=True)
-class Layout:
-    """Columns of one kind of file.
-
-    Attributes
-    ----------
-    required, optional : tuple of str
-        Names of columns.
-    degrees : tuple of str
-        Those that hold degrees.
-    """
-
-    required: tuple[str, ...]
-    optional: tuple[str, ...] = ()
-    degrees: tuple[str, ...] = ()
-
-
-LAYOUTS: dict[str, Layout] = {
-    "two_way_range": Layout(
-        ("beacon", "t_transmit", "t_receive"),
-        ("travel_time", "slant_range", "sound_speed", "sigma"),
-    ),
-    "one_way_range": Layout(("beacon", "t_transmit", "t_receive"), ("sigma",)),
-    "velocity": Layout(("t", "forward", "right", "down"), ("sigma", "reference")),
-    "attitude": Layout(
-        ("t", "heading"), ("pitch", "roll", "sigma"), ("heading", "pitch", "roll", "sigma")
-    ),
-    "depth": Layout(("t", "depth"), ("sigma",)),
-    "position": Layout(("t", "east", "north"), ("up", "sigma", *_COVARIANCE)),
-    "geodetic_position": Layout(("t", "latitude", "longitude"), ("height", "sigma", *_COVARIANCE)),
-    "sound_speed": Layout(("depth", "speed")),
-}
 
 
 def read_two_way_range(
@@ -100,9 +71,9 @@ def read_two_way_range(
     ConfigurationError
         Where a turnaround is needed and the beacon has none.
     """
-    table = _open("two_way_range", read_table(file))
+    table = opened("two_way_range", read_table(file))
     if "travel_time" in table:
-        return _records(TwoWayRange, "two_way_range", table, sigma=sigma)
+        return records_of(TwoWayRange, "two_way_range", table, sigma=sigma)
     times = table.text("beacon"), table.numbers("t_transmit"), table.numbers("t_receive")
     spread = table.numbers("sigma") if "sigma" in table else sigma
     if "slant_range" in table or "sound_speed" in table:
@@ -135,8 +106,19 @@ def read_one_way_range(file: str | Path, sigma: float = TRAVEL_TIME_SIGMA) -> On
     DataError
         Where the file or a value in it is wrong.
     """
-    table = _open("one_way_range", read_table(file))
-    return _records(OneWayRange, "one_way_range", table, sigma=sigma)
+    table = opened("one_way_range", read_table(file))
+    return records_of(OneWayRange, "one_way_range", table, sigma=sigma)
+
+
+def read_slant_range(file: str | Path) -> SlantRange:
+    """Read distances in metres: ``t, beacon, distance[, sigma]``, s and m.
+
+    Raises
+    ------
+    DataError
+        Where the file or a value in it is wrong.
+    """
+    return records_of(SlantRange, "slant_range", opened("slant_range", read_table(file)))
 
 
 def read_velocity(file: str | Path) -> Velocity:
@@ -147,7 +129,7 @@ def read_velocity(file: str | Path) -> Velocity:
     DataError
         Where the file or a value in it is wrong.
     """
-    return _records(Velocity, "velocity", _open("velocity", read_table(file)))
+    return records_of(Velocity, "velocity", opened("velocity", read_table(file)))
 
 
 def read_attitude(file: str | Path) -> Attitude:
@@ -158,7 +140,63 @@ def read_attitude(file: str | Path) -> Attitude:
     DataError
         Where the file or a value in it is wrong.
     """
-    return _records(Attitude, "attitude", _open("attitude", read_table(file)))
+    return records_of(Attitude, "attitude", opened("attitude", read_table(file)))
+
+
+def read_heading(file: str | Path) -> Heading:
+    """Read compass headings: ``t, heading[, sigma]``, s and degrees.
+
+    Raises
+    ------
+    DataError
+        Where the file or a value in it is wrong.
+    """
+    return records_of(Heading, "heading", opened("heading", read_table(file)))
+
+
+def read_angular_rate(file: str | Path) -> AngularRate:
+    """Read gyros: ``t, about_down[, about_forward, about_right, sigma]``, s and degrees/s.
+
+    Raises
+    ------
+    DataError
+        Where the file or a value in it is wrong.
+    """
+    return records_of(AngularRate, "angular_rate", opened("angular_rate", read_table(file)))
+
+
+def read_odometry(file: str | Path) -> Odometry:
+    """Read changes of pose.
+
+    Parameters
+    ----------
+    file : path
+        CSV with ``t_from, t_to`` (s), ``forward, right`` (m), ``about_down`` (degrees) and, where
+        the vehicle does not move in a plane, ``down`` (m), ``about_forward, about_right``
+        (degrees), of which those left out are zero. ``sigma`` (m, each displacement) and
+        ``sigma_turn`` (degrees, each rotation) stand together or not at all.
+
+    Returns
+    -------
+    Odometry
+
+    Raises
+    ------
+    DataError
+        Where the file or a value in it is wrong.
+    """
+    table = opened("odometry", read_table(file))
+    spatial = [name for name in Odometry.SPATIAL if name in table]
+    zeros: dict[str, Any] = dict.fromkeys(Odometry.SPATIAL if spatial else (), 0.0)
+    spread: dict[str, Any] = {}
+    if "sigma" in table or "sigma_turn" in table:
+        table.require("sigma", "sigma_turn")
+        spread["covariance"] = odometry_covariance(
+            bounded(table, "sigma", 1e-6, 1e4, "m"),
+            np.deg2rad(degrees(table, "sigma_turn", 1e-6, 180.0)),
+            3 if spatial else 2,
+        )
+    return records_of(Odometry, "odometry", table, **zeros, **spread)
 
 
 def read_depth(file: str | Path) -> Depth:
@@ -169,7 +207,7 @@ def read_depth(file: str | Path) -> Depth:
     DataError
         Where the file or a value in it is wrong.
     """
-    return _records(Depth, "depth", _open("depth", read_table(file)))
+    return records_of(Depth, "depth", opened("depth", read_table(file)))
 
 
 def read_position(file: str | Path, origin: GeodeticOrigin | None = None) -> PositionFix:
@@ -199,10 +237,10 @@ def read_position(file: str | Path, origin: GeodeticOrigin | None = None) -> Pos
     """
     table = read_table(file)
     geodetic = "east" not in table and ("latitude" in table or "longitude" in table)
-    _open("geodetic_position" if geodetic else "position", table)
+    opened("geodetic_position" if geodetic else "position", table)
     spread: dict[str, Any] = {}
     vertical = "height" if geodetic else "up"
-    if any(name in table for name in _COVARIANCE):
+    if any(name in table for name in COVARIANCE):
         spread["covariance"] = _covariance(table, vertical)
     elif "sigma" in table:
         spread["sigma"] = table.numbers("sigma")
@@ -229,7 +267,7 @@ def read_sound_speed(file: str | Path) -> SoundSpeedProfile:
     DataError
         Where the file or a value in it is wrong, or depths do not increase from row to row.
     """
-    table = _open("sound_speed", read_table(file).lower())
+    table = opened("sound_speed", read_table(file).lower())
     depth, speed = table.finite("depth"), table.finite("speed")
     outside = (speed < SLOWEST) | (speed > FASTEST)
     if outside.any():
@@ -243,67 +281,6 @@ def read_sound_speed(file: str | Path) -> SoundSpeedProfile:
         raise table.source.error(i, "depth", problem, "sort by depth and drop duplicates")
     with naming(file):
         return SoundSpeedProfile(depth, speed)
-
-
-def degrees(table: Table, name: str, low: float, high: float) -> FloatArray:
-    """Return a column of angles in degrees, checked.
-
-    Parameters
-    ----------
-    table : Table
-    name : str
-    low, high : float
-        What is legal, degrees.
-
-    Returns
-    -------
-    array, shape (M,)
-
-    Raises
-    ------
-    DataError
-        Where a value is no number, not finite or not legal.
-    """
-    values = table.finite(name)
-    outside = (values < low) | (values > high)
-    if outside.any():
-        i = int(np.argmax(outside))
-        problem = f"{values[i]} degrees is outside {low:g} to {high:g} degrees"
-        raise table.source.error(i, name, problem, "check the unit")
-    return values
-
-
-def _open(layout: str, table: Table) -> Table:
-    """Check the names of a table's columns; return the table."""
-    columns = LAYOUTS[layout]
-    table.require(*columns.required)
-    absent = [name for name in columns.optional if name not in table]
-    for name in table.names:
-        near = None if name in columns.required + columns.optional else nearest(name, absent)
-        if near:
-            raise DataError(
-                f"unknown column '{name}'",
-                f"did you mean '{near}'? rename it, or give it a name of its own",
-                file=table.file,
-                field=name,
-            )
-    return table
-
-
-def _records(kind: type[AnyRecords], layout: str, table: Table, **defaults: Any) -> AnyRecords:
-    columns = {
-        f.name: _column(kind, layout, table, f.name) for f in fields(kind) if f.name in table
-    }
-    return kind(**{**defaults, **columns, "source": table.source})
-
-
-def _column(kind: type[Records], layout: str, table: Table, name: str) -> Any:
-    if name in kind.TEXT:
-        return table.text(name)
-    if name in LAYOUTS[layout].degrees:
-        low, high, _ = kind.LIMITS[name]
-        return np.deg2rad(degrees(table, name, float(np.rad2deg(low)), float(np.rad2deg(high))))
-    return table.numbers(name)
 
 
 def _turnarounds(table: Table, beacons: Sequence[Beacon]) -> FloatArray:

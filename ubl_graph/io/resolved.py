@@ -108,7 +108,12 @@ def _time_span(records: Records) -> tuple[float, float]:
 
 
 def _start(start: Start) -> dict[str, Any]:
-    return _plain(asdict(start))
+    stated = asdict(start)
+    heading, sigma = stated.pop("heading"), stated.pop("heading_sigma")
+    if heading is not None:
+        stated["heading_deg"] = float(np.rad2deg(heading))
+        stated["heading_sigma_deg"] = float(np.rad2deg(sigma))
+    return _plain(stated)
 
 
 def _plain(mapping: dict[str, Any]) -> dict[str, Any]:

@@ -23,7 +23,16 @@ import numpy as np
 from ubl_graph.arrays import FloatArray
 from ubl_graph.errors import DataError
 from ubl_graph.evaluation import Errors, evaluate
+from ubl_graph.io.pose_columns import (
+    ATTITUDE_COLUMNS,
+    COVARIANCE_COLUMNS,
+    attitude_table,
+    covariance_table,
+    pose_tracks,
+)
 from ubl_graph.io.resolved import resolved
+from ubl_graph.mission import Mission
+from ubl_graph.pose_trajectory import PoseTrajectory
 from ubl_graph.result import RangeResiduals, Result, SegmentResult, SlowState
 from ubl_graph.trajectory import Trajectory
 
@@ -42,6 +51,7 @@ SLOW_COMPONENTS = {
     "clock_offset": ("clock_offset",),
     "clock_drift": ("clock_drift",),
     "current": ("current_east", "current_north"),
+    "heading_bias": ("heading_bias",),
 }
 
 
@@ -76,7 +86,12 @@ def write_result(
     """
     folder = Path(folder)
     with _staged(folder) as stage:
-        _write_rows(stage / "trajectory.csv", TRAJECTORY_COLUMNS, _trajectory_rows(result))
+        has_poses = any(pose_tracks(result))
+        columns = TRAJECTORY_COLUMNS + (ATTITUDE_COLUMNS if has_poses else ())
+        _write_rows(stage / "trajectory.csv", columns, _trajectory_rows(result))
+        if has_poses:
+            rows = _covariance_rows(result)
+            _write_rows(stage / "pose_covariance.csv", COVARIANCE_COLUMNS, rows)
         if result.residuals is not None:
             _write_rows(stage / "residuals.csv", RESIDUAL_COLUMNS, _residual_rows(result))
         if any(s.slow for s in result.segments):
@@ -113,6 +128,7 @@ def summary(result: Result) -> dict[str, Any]:
     dof = sum(s.degrees_of_freedom for s in _problems(result))
     content: dict[str, Any] = {
         "mission": result.mission.name,
+        "node": result.mission.options.node,
         "status": result.status,
         "reason": result.reason,
         "warnings": list(result.warnings),
@@ -128,7 +144,10 @@ def summary(result: Result) -> dict[str, Any]:
             name: {"value": s.value.tolist(), "sigma": s.sigma.tolist()}
             for name, s in result.shared.items()
         },
-        "segments": [_segment_summary(s, errors.get(s.name)) for s in result.segments],
+        "segments": [
+            {**_segment_summary(s, errors.get(s.name)), **_odometry_noise(result.mission, s.name)}
+            for s in result.segments
+        ],
         **({} if result.tuning is None else {"tuning": asdict(result.tuning)}),
         "wall_times_s": {name: round(t, 4) for name, t in result.wall_times.items()},
         "versions": versions(),
@@ -165,14 +184,28 @@ def _segment_summary(segment: SegmentResult, errors: Errors | None) -> dict[str,
         "t_last": float(segment.trajectory.t[-1]),
         "solver": segment.solver,
         "cost": segment.cost,
+        "runner_up": segment.runner_up,
         "iterations": segment.iterations,
         "chi_square_per_dof": segment.chi_square / max(segment.degrees_of_freedom, 1),
         "median_sd_m": dict(zip(("east", "north", "up"), np.median(sd, axis=0), strict=True)),
         "slow_states": {name: _slow_summary(s) for name, s in segment.slow.items()},
     }
+    if isinstance(segment.trajectory, PoseTrajectory):
+        heading = np.median(segment.trajectory.attitude_sigma[:, 0])
+        content["median_sd_heading_deg"] = float(np.rad2deg(heading))
     if errors is not None:
         content["reference"] = errors.summary()
     return content
+
+
+def _odometry_noise(mission: Mission, name: str) -> dict[str, str]:
+    """Which noise a segment's odometry records were given; nothing where there are none."""
+    for segment in mission.segments:
+        records = segment.odometry
+        if segment.name == name and records is not None and len(records):
+            told = records.covariance is not None
+            return {"odometry_noise": mission.options.odometry_noise if told else "growing"}
+    return {}
 
 
 def _slow_summary(state: SlowState) -> dict[str, Any]:
@@ -198,9 +231,21 @@ def _trajectory_rows(result: Result) -> Iterator[list[str]]:
     for segment in result.segments:
         track = segment.trajectory
         sd = np.sqrt(np.einsum("nii->ni", track.covariance))
-        table = np.column_stack([track.position, track.velocity, sd, track.covariance[:, 0, 1]])
+        parts = [track.position, track.velocity, sd, track.covariance[:, 0, 1]]
+        if isinstance(track, PoseTrajectory):
+            parts.append(attitude_table(track))
+            if track.still and len(track.t) == 1:
+                # Nothing says how fast a lone pose moves that knows no velocity.
+                parts[1] = np.full_like(track.velocity, np.nan)
+        table = np.column_stack(parts)
         for t, row in zip(track.t, table, strict=True):
             yield [segment.name, _time(t), *_numbers(row)]
+
+
+def _covariance_rows(result: Result) -> Iterator[list[str]]:
+    for name, track in pose_tracks(result):
+        for t, row in zip(track.t, covariance_table(track), strict=True):
+            yield [name, _time(t), *(_scientific(v, 9) for v in row)]
 
 
 def _residual_rows(result: Result) -> Iterator[list[str]]:
@@ -233,7 +278,7 @@ def _slow_table(result: Result) -> tuple[list[str], Iterator[list[str]]]:
             values = np.concatenate([s.value for s in states], axis=1)
             sigmas = np.concatenate([s.sigma for s in states], axis=1)
             for t, value, sigma in zip(segment.trajectory.t, values, sigmas, strict=True):
-                yield [segment.name, _time(t), *(f"{v:.6e}" for v in (*value, *sigma))]
+                yield [segment.name, _time(t), *(_scientific(v, 6) for v in (*value, *sigma))]
 
     return ["segment", "t", *components, *(f"sd_{c}" for c in components)], rows()
 
@@ -244,8 +289,18 @@ def _time(t: float) -> str:
 
 
 def _numbers(row: FloatArray) -> list[str]:
-    # A micrometre, and never "-0.000000".
-    return [f"{v + 0.0:.6f}" if abs(v) >= 5e-7 else "0.000000" for v in row]
+    return [_number(v) for v in row]
+
+
+def _number(v: float) -> str:
+    """A micrometre, and never "-0.000000"; nothing where there is no number."""
+    if not np.isfinite(v):
+        return ""
+    return f"{v:.6f}" if abs(v) >= 5e-7 else "0.000000"
+
+
+def _scientific(v: float, digits: int) -> str:
+    return f"{v:.{digits}e}" if np.isfinite(v) else ""
 
 
 def _write_rows(path: Path, columns: Iterable[str], rows: Iterable[list[str]]) -> None:

@@ -8,14 +8,15 @@ import numpy as np
 
 from ubl_graph.arrays import FloatArray
 from ubl_graph.assembly import UNOBSERVED_SHARE
+from ubl_graph.builder import SegmentModel
 from ubl_graph.errors import SolverError
 from ubl_graph.factors.ranges import RangeBlock
-from ubl_graph.graph import SegmentModel, build_problem, model_segment
-from ubl_graph.layout import KINEMATIC
+from ubl_graph.graph import build_problem, model_segment
 from ubl_graph.mission import Mission
 from ubl_graph.nodes import NOMINAL_SPEED
 from ubl_graph.observability.dilution import Dops, graph_dops
 from ubl_graph.observability.directions import Rank, rank, reduced
+from ubl_graph.pose_trajectory import PoseTrajectory
 from ubl_graph.problem import Problem
 from ubl_graph.result import Result, SegmentResult
 from ubl_graph.smoother import AMBIGUOUS_COST, smooth
@@ -160,8 +161,14 @@ def _observability(
     beacons = np.stack([result.beacons[str(name)].value for name in heard])
     measured = tuple(b for b in problem.blocks if not b.name.endswith(" prior"))
     turned = unanchored(model) is not None
+    # A heading that the reference may misread by anything holds no track; priors on it may.
+    unheld = turned or (
+        len(heard) == 1
+        and problem.layout.has("heading_bias")
+        and "position" not in model.segment.records()
+    )
     return Observability(
-        _turned(_rank(replace(problem, blocks=measured), x, beacons), turned),
+        _turned(_rank(replace(problem, blocks=measured), x, beacons), unheld),
         _turned(_rank(problem, x, beacons), turned),
         graph_dops(mission, solved),
         solved.trajectory.t,
@@ -173,8 +180,17 @@ def _vector(problem: Problem, result: Result, solved: SegmentResult) -> FloatArr
     """The flat vector of what was estimated."""
     layout = problem.layout
     x = np.zeros(layout.size)
-    for name in KINEMATIC[: layout.order]:
-        layout.put(x, name, getattr(solved.trajectory, name))
+    trajectory = solved.trajectory
+    if isinstance(trajectory, PoseTrajectory):
+        still = np.zeros(len(trajectory.t))
+        states = (trajectory.position, trajectory.velocity, np.zeros_like(trajectory.position))
+        track = Track(*states, still, still, 0.0, trajectory.rotation)
+        place(layout, layout.chains[0], track, x)
+        if not layout.still:
+            layout.put(x, "rate", trajectory.rate[:, -dict(layout.kinematic)["rate"] :])
+    else:
+        for name, _ in layout.kinematic:
+            layout.put(x, name, getattr(trajectory, name))
     for name, _ in layout.slow:
         layout.put(x, name, solved.slow[name].value)
     for name, _ in layout.shared:
@@ -195,7 +211,7 @@ def _rank(problem: Problem, x: FloatArray, beacons: FloatArray) -> Rank:
     turn = np.repeat(turn, layout.node_width)
     turn = np.append(turn, np.full(layout.size - len(turn), -1))
     _, jacobian = problem.linearize(x, problem.frozen(x))
-    names = [*KINEMATIC[: layout.order], *(name for name, _ in layout.slow)]
+    names = [name for name, _ in layout.kinematic + layout.slow]
     states = {n: layout.node_columns(n, np.array([middle]))[0] for n in names}
     states |= {n: layout.shared_columns(n) for n, _ in layout.shared}
     kept = np.flatnonzero(turn < 0)
@@ -210,8 +226,8 @@ def _rank(problem: Problem, x: FloatArray, beacons: FloatArray) -> Rank:
 def _turned(found: Rank, open_: bool) -> Rank:
     """The rank without the turn of the whole track about a lone beacon, where that is open.
 
-    The motion prior's residuals turn with the track, so that its rows, linearised where they are
-    not zero, seem to hold it.
+    The residuals of motion prior and odometry turn with the track, so that their rows, linearised
+    where they are not zero, seem to hold it.
     """
     if not open_ or found.unobserved:
         return found
@@ -221,10 +237,12 @@ def _turned(found: Rank, open_: bool) -> Rank:
 def _sizes(problem: Problem, x: FloatArray, beacons: FloatArray) -> dict[str, float]:
     """Changes as large as the geometry, SI, by the first word of a state's name."""
     layout = problem.layout
-    position, velocity = layout.get(x, "position"), layout.get(x, "velocity")
-    length = float(np.median(np.linalg.norm(position[:, None] - beacons, axis=2)))
+    length = float(np.median(np.linalg.norm(layout.positions(x)[:, None] - beacons, axis=2)))
     span = max(float(layout.chains[0].t[-1] - layout.chains[0].t[0]), 1.0)
-    speed = max(float(np.sqrt(np.mean(np.sum(velocity**2, axis=1)))), length / span)
+    speed = length / span
+    if layout.has("velocity"):
+        velocity = layout.get(x, "velocity")
+        speed = max(float(np.sqrt(np.mean(np.sum(velocity**2, axis=1)))), speed)
     flight = length / NOMINAL_SPEED
     return {
         "position": length,
@@ -239,6 +257,11 @@ def _sizes(problem: Problem, x: FloatArray, beacons: FloatArray) -> dict[str, fl
         "dvl_scale": 1.0,
         "dvl_misalignment": 1.0,
         "heading_bias": 1.0,
+        "rotation": 1.0,
+        "rate": speed / length,
+        "gyro_bias": 1.0 / span,
+        "odometry_scale": 1.0,
+        "odometry_turn_bias": 1.0 / span,
     }
 
 
@@ -292,7 +315,7 @@ def _mirror(
     for image in _images(mission, model, track_of(layout, chain, x), beacons):
         begin = x.copy()
         place(layout, chain, image, begin)
-        apart = _rms(image.position - layout.get(x, "position"))
+        apart = _rms(image.position - layout.positions(x))
         if apart < LEAST_SEPARATION:
             continue
         told = [
@@ -313,7 +336,7 @@ def _images(
     images = mirror_images(mission, model, track)
     if images:
         return images
-    odometry = model.bottom is not None or model.water is not None
+    odometry = model.still or model.bottom is not None or model.water is not None
     image = replace(track, position=mirror_image(track.position, beacons, odometry=odometry))
     if odometry:
         return [image]
@@ -332,7 +355,7 @@ def _extra_cost(
     except SolverError:
         return float("inf")
     layout = problem.layout
-    gap = _rms(layout.get(end.x, "position") - layout.get(x, "position"))
+    gap = _rms(layout.positions(end.x) - layout.positions(x))
     return max(end.cost - cost, 0.0) if gap > apart else float("inf")
 
 

@@ -10,31 +10,42 @@ from typing import Any
 import numpy as np
 
 from ubl_graph.measurements import (
+    Odometry,
     OneWayRange,
     PositionFix,
+    SlantRange,
     TwoWayRange,
 )
 from ubl_graph.mission import RECORD_KINDS, Start
 from ubl_graph.records import Records
 
 #: Kinds that hold ranges.
-PINGS = ("two_way_range", "one_way_range")
+PINGS = ("two_way_range", "one_way_range", "slant_range")
 #: Kinds that say where the vehicle is, each in the frame of the beacons.
 ABSOLUTE = (*PINGS, "position", "set_position")
 #: All kinds: those of a mission, and the positions set by hand.
 KINDS = (*RECORD_KINDS, "set_position")
 _KIND_OF = {made: kind for kind, (made, _) in RECORD_KINDS.items()}
-#: Columns of the kinds whose records are all numbers.
+#: Columns of the kinds whose records are all numbers, but for the covariance of odometry.
 _COLUMNS: dict[str, tuple[str, ...]] = {
     "velocity": ("t", "forward", "right", "down", "sigma", "reference"),
     "attitude": ("t", "heading", "pitch", "roll", "sigma"),
     "depth": ("t", "depth", "sigma"),
     "two_way_range": ("beacon", "t_transmit", "t_receive", "travel_time", "sigma"),
     "one_way_range": ("beacon", "t_transmit", "t_receive", "sigma"),
+    "slant_range": ("beacon", "t", "distance", "sigma"),
+    "heading": ("t", "heading", "sigma"),
+    "angular_rate": ("t", "about_forward", "about_right", "about_down", "sigma"),
+    "odometry": (
+        *("t_from", "t_to", "forward", "right", "down"),
+        *("about_forward", "about_right", "about_down", "covariance"),
+    ),
 }
+#: Kinds whose last record before a window says what holds where it begins.
+HELD = ("velocity", "attitude", "heading", "angular_rate")
 #: Neighbours are looked for among so many entries.
 LOOK = 50
-_TIMES = frozenset({"t", "t_transmit", "t_receive"})
+_TIMES = frozenset({"t", "t_transmit", "t_receive", "t_from", "t_to"})
 
 
 @dataclass(slots=True, eq=False)
@@ -70,8 +81,12 @@ class Entry:
     @property
     def key(self) -> tuple[Any, ...]:
         """What makes a duplicate."""
+        if self.kind == "slant_range":
+            return (self.kind, *self.values[:2])
         if self.kind in PINGS:
             return (self.kind, *self.values[:3])
+        if self.kind == "odometry":
+            return (self.kind, *self.values[:2])
         if self.kind == "velocity":
             return (self.kind, self.t, self.values[-1])
         return (self.kind, self.t)
@@ -99,12 +114,23 @@ def entry_of(record: Records | Start) -> Entry:
     if isinstance(record, PositionFix):
         t = float(record.t[0])
         return Entry(kind, record, (t, record.position, record.covariances), t, t)
-    values = tuple(getattr(record, name)[0].item() for name in _COLUMNS[kind])
+    values = tuple(_plain(getattr(record, name)) for name in _COLUMNS[kind])
+    if isinstance(record, Odometry):
+        return Entry(kind, record, values, values[1], values[0])
+    if isinstance(record, SlantRange):
+        return Entry(kind, record, values, values[1], values[1])
     if isinstance(record, OneWayRange):
         return Entry(kind, record, values, values[2], values[2])
     if isinstance(record, TwoWayRange):
         return Entry(kind, record, values, values[2], values[1])
     return Entry(kind, record, values, values[0], values[0])
+
+
+def _plain(column: Any) -> Any:
+    """The one value of a column, a matrix as it is; None where there is no column."""
+    if column is None or column.ndim > 1:
+        return None if column is None else column[0]
+    return column[0].item()
 
 
 def _time(entry: Entry) -> float:
@@ -156,6 +182,11 @@ class Buffer:
             bisect_left(entries, begin, key=_time) : bisect_left(entries, end, key=_time)
         ]
 
+    def reaching(self, kind: str, begin: float) -> list[Entry]:
+        """Entries of a kind that end after `begin`, s."""
+        entries = self._entries[kind]
+        return entries[bisect_right(entries, begin, key=_time) :]
+
     def around(self, kind: str, begin: float, end: float) -> list[Entry]:
         """The same with one more entry on either side, gated ones left out."""
         entries = self._entries[kind]
@@ -184,11 +215,11 @@ class Buffer:
     def trim(self, begin: float) -> list[Entry]:
         """Drop what ended before `begin`, but for each kind's last record there; what was dropped.
 
-        The last velocity and attitude before a window say what holds where it begins.
+        The last velocity, attitude or turn before a window says what holds where it begins.
         """
         dropped: list[Entry] = []
         for kind, entries in self._entries.items():
-            spare = 1 if kind in ("velocity", "attitude") else 0
+            spare = 1 if kind in HELD else 0
             stop = bisect_left(entries, begin, key=_time) - spare
             if stop > 0:
                 dropped += entries[:stop]
@@ -216,10 +247,31 @@ class Buffer:
 
 
 def columns_of(kind: str, entries: list[Entry]) -> Any:
-    """Records of one kind (no fixes) from their entries, on the window's clock."""
+    """Records of one kind (no fixes, no odometry) from their entries, on the window's clock."""
     columns = zip(*(e.values for e in entries), strict=True)
     made = RECORD_KINDS[kind][0]
     return made.unchecked(**{n: np.array(c) for n, c in zip(_COLUMNS[kind], columns, strict=True)})
+
+
+def odometry_of(entries: list[Entry]) -> list[Odometry]:
+    """Odometry from its entries, that of each shape apart: planar or not, with noise or without."""
+    names = _COLUMNS["odometry"]
+    shapes: dict[tuple[Any, ...], list[Entry]] = {}
+    for entry in entries:
+        shape = tuple(None if v is None else np.shape(v) for v in entry.values)
+        shapes.setdefault(shape, []).append(entry)
+    return [
+        Odometry.unchecked(
+            **{
+                name: np.array(column)
+                for name, column in zip(
+                    names, zip(*(e.values for e in some), strict=True), strict=True
+                )
+                if column[0] is not None
+            }
+        )
+        for some in shapes.values()
+    ]
 
 
 def fixes_of(entries: list[Entry]) -> list[PositionFix]:

@@ -24,9 +24,9 @@ from ubl_graph.errors import DataError, UblGraphError
 from ubl_graph.frames import GeodeticOrigin, LeverArm
 from ubl_graph.measurements import PositionFix
 from ubl_graph.mission import Setup, Start, Vehicle
-from ubl_graph.online.buffer import Entry, columns_of
+from ubl_graph.online.buffer import Entry, columns_of, odometry_of
+from ubl_graph.online.frame import Break
 from ubl_graph.online.gate import MEMORY, Gate
-from ubl_graph.online.rows import Break
 from ubl_graph.online.state import Moment
 from ubl_graph.options import Options
 
@@ -149,8 +149,8 @@ def _restored(cls: type[FixedLagEstimator], told: dict[str, Any]) -> FixedLagEst
         core.gates[kind] = _gate(gate, entries)
     for name, value in told["state"].items():
         if name == "moment" and value is not None:
-            mean, covariance = np.array(value["mean"]), np.array(value["covariance"])
-            value = Moment(value["t"], mean, covariance)
+            parts: dict[str, Any] = {k: v if v is None else np.array(v) for k, v in value.items()}
+            value = Moment(**{**parts, "t": value["t"]})
         if name == "rival" and value is not None:
             value = np.array(value)
         setattr(core.state, name, value)
@@ -212,6 +212,10 @@ def _entry(told: dict[str, Any]) -> Entry:
         t, place, covariance = values
         up = place[:, 2] if place.shape[1] == 3 else None
         blank.record = PositionFix(t, place[:, 0], place[:, 1], up, covariance=covariance)
+    elif kind == "odometry":
+        if values[-1] is not None:
+            blank.values = (*values[:-1], np.array(values[-1]))
+        blank.record = odometry_of([blank])[0]
     else:
         blank.record = columns_of(kind, [blank])
     return blank
@@ -243,6 +247,12 @@ def _tracker_told(tracker: Tracker) -> dict[str, Any]:
             "breaks": {str(k): asdict(jump) for k, jump in window.breaks.items()},
             "pristine": window.is_pristine,
         }
+        if window.frame.is_posed:
+            told["window"]["poses"] = {
+                "up": window.up.tolist(),
+                "made_at": window.made_at.tolist(),
+                "dirty": window.dirty,
+            }
     return told
 
 
@@ -264,6 +274,11 @@ def _restore_tracker(tracker: Tracker, told: dict[str, Any]) -> None:
         {int(k): Break(**jump) for k, jump in window["breaks"].items()},
         window["pristine"],
     )
+    if "poses" in window and tracker.window is not None:
+        poses = window["poses"]
+        tracker.window.restore_poses(
+            np.array(poses["up"]), np.array(poses["made_at"]), poses["dirty"]
+        )
 
 
 def _gate_told(gate: Gate, number: dict[int, int]) -> dict[str, Any]:
@@ -295,10 +310,7 @@ def _state_told(state: Any) -> dict[str, Any]:
     for f in fields(state):
         value = getattr(state, f.name)
         if isinstance(value, Moment):
-            value = {
-                "t": value.t,
-                "mean": value.mean.tolist(),
-                "covariance": value.covariance.tolist(),
-            }
+            parts = {part.name: getattr(value, part.name) for part in fields(value)}
+            value = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in parts.items()}
         told[f.name] = value.tolist() if isinstance(value, np.ndarray) else value
     return told

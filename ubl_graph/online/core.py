@@ -11,9 +11,9 @@ import numpy as np
 from ubl_graph.online.buffer import ABSOLUTE, PINGS, Entry, entry_of
 from ubl_graph.online.clock import MOST_HELD
 from ubl_graph.online.finder import Finder
+from ubl_graph.online.frame import Break
 from ubl_graph.online.gate import REOPENS, Gate, limit, step_distance
 from ubl_graph.online.outputs import Event, Outcome
-from ubl_graph.online.rows import Break
 
 #: Without a ping the window is solved and moved on after so many seconds of records.
 LONGEST_REST = 5.0
@@ -26,6 +26,8 @@ LEAP_SLACK = 5.0
 SILENCE, SILENCE_INTERVALS = 1.0, 5.0
 #: Vertical acceleration noise of a vehicle that begins to dive, m^2/s^3.
 DIVE_PSD = 0.05
+#: Vertical speed (m/s), and sudden step (m), of a vehicle whose height follows its depth sensor.
+HEAVE = 0.5
 #: The step that a clock set back may hide: seconds of way, m, and speed, m/s.
 CLOCK_STEP = Break(5.0, 0.5)
 
@@ -240,6 +242,8 @@ class Core(Finder):
             before, after = self.tracker.buffer.neighbours(entry)
             near = before if before is not None else after
             return (0.0, 3) if near is None else step_distance(entry, near)
+        if self.setup.options.node == "pose2":
+            return self._depth_step(entry)
         m = self.recent()
         if m is None or self.state.waiting:
             return 0.0, 1
@@ -261,13 +265,24 @@ class Core(Finder):
             self.gates["depth"].surprises.append(away * away / max(known + psd * cube, 1e-12))
         return away / math.sqrt(max(variance, 1e-12)), 1
 
+    def _depth_step(self, entry: Entry) -> tuple[float, int]:
+        """Distance of a depth from the sensor's last one: a planar vehicle is held at them."""
+        before, after = self.tracker.buffer.neighbours(entry)
+        near = before if before is not None else after
+        if near is None:
+            return 0.0, 1
+        dt = abs(entry.t - near.t)
+        variance = entry.values[2] ** 2 + near.values[2] ** 2 + (HEAVE * dt) ** 2 + HEAVE**2
+        return abs(entry.values[1] - near.values[1]) / math.sqrt(variance), 1
+
     def _reopen_motion(self, gate: Gate) -> None:
         """A sensor of motion that is refused again and again, and agrees with itself, is right."""
         run = gate.run[-REOPENS:]
         if len(run) < REOPENS:
             return
         if run[0].kind != "depth":
-            if any(step_distance(b, a)[0] > limit(3) for a, b in pairwise(run)):
+            steps = [step_distance(b, a) for a, b in pairwise(run)]
+            if any(away > limit(dof) for away, dof in steps):
                 return
         else:
             spread = np.ptp([e.values[1] for e in run])

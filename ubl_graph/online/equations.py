@@ -42,19 +42,21 @@ class LinearRows:
     ----------
     width, border : int
         Columns of a node, and of what all nodes share.
+    height : int
+        Rows of an interval.
 
     Attributes
     ----------
-    rows : array, shape (N - 1, C, C)
+    rows : array, shape (N - 1, H, C)
         Of each interval, over two nodes and what is shared.
-    targets : array, shape (N - 1, C)
+    targets : array, shape (N - 1, H)
         Their right-hand sides.
     """
 
-    def __init__(self, width: int, border: int) -> None:
+    def __init__(self, width: int, border: int, height: int) -> None:
         self._width, self._border = width, border
         size = 2 * width + border
-        self.rows, self.targets = np.zeros((1, size, size)), np.zeros((1, size))
+        self.rows, self.targets = np.zeros((1, height, size)), np.zeros((1, height))
         self._products = np.zeros((1, size, size))
         self._span = 2
         self._band = np.zeros((2, width * self.reach))

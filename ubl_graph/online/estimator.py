@@ -18,7 +18,15 @@ from ubl_graph.arrays import FloatArray
 from ubl_graph.beacon import Beacon
 from ubl_graph.errors import DataError, TimeError
 from ubl_graph.frames import GeodeticOrigin
-from ubl_graph.measurements import OneWayRange, TwoWayRange, Velocity
+from ubl_graph.measurements import (
+    AngularRate,
+    Heading,
+    Odometry,
+    OneWayRange,
+    SlantRange,
+    TwoWayRange,
+    Velocity,
+)
 from ubl_graph.mission import Mission, Setup, Start, Vehicle
 from ubl_graph.nodes import grid_options
 from ubl_graph.online.buffer import entry_of
@@ -115,8 +123,8 @@ class FixedLagEstimator:
         Raises
         ------
         DataError
-            Where a range names an unknown beacon, or a velocity needs what the options leave out;
-            the estimate is untouched.
+            Where a range names an unknown beacon, a velocity needs what the options leave out, or
+            nodes that are points cannot use the record; the estimate is untouched.
         """
         self._check(record)
         self.core.events = []
@@ -130,17 +138,33 @@ class FixedLagEstimator:
         return replace(outcome, others=others)
 
     def set_position(
-        self, t: float, east: float, north: float, up: float | None = None, sigma: float = 10.0
+        self,
+        t: float,
+        east: float,
+        north: float,
+        up: float | None = None,
+        sigma: float = 10.0,
+        heading: float | None = None,
+        heading_sigma: float = 0.1,
     ) -> Outcome:
         """Say where the vehicle's reference point is at a time: seconds, metres.
+
+        Parameters
+        ----------
+        t, east, north, up, sigma : float
+            As of `Start`.
+        heading, heading_sigma : float, optional
+            Where nodes are poses: clockwise from true north, rad, and its standard deviation.
 
         Raises
         ------
         ConfigurationError
-            Where a number is not finite, or sigma is not positive.
+            Where a number is not finite, a sigma is not positive, or points are given a heading.
         """
+        start = Start(t, east, north, up, sigma, heading, heading_sigma)
+        self.setup.check_start(start)
         self.core.events = []
-        outcome = self.core.admit(entry_of(Start(t, east, north, up, sigma)))
+        outcome = self.core.admit(entry_of(start))
         return Outcome(outcome.accepted, outcome.reason, outcome.final, tuple(self.core.events))
 
     def flush(self) -> tuple[Event, ...]:
@@ -195,7 +219,14 @@ class FixedLagEstimator:
         self.core.state.rebuilt = False
         if moment is None:
             return Estimate(stamp, None, None, None, status, reasons)
-        return Estimate(stamp, moment.mean[:3], moment.mean[3:], covariance, status, reasons)
+        position, velocity, pose = moment.mean[:3], moment.mean[3:], moment.pose_covariance
+        if pose is not None and covariance is not None:
+            # What another place adds it adds here, too.
+            pose = pose.copy()
+            pose[:3, :3] = covariance[:3, :3]
+        return Estimate(
+            stamp, position, velocity, covariance, status, reasons, moment.rotation, pose
+        )
 
     def smoothed(self, t: float | FloatArray) -> States:
         """Position and velocity in the window, with all that has come since.
@@ -293,10 +324,12 @@ class FixedLagEstimator:
         if not isinstance(record, Records):  # pyright: ignore[reportUnnecessaryIsInstance]
             raise DataError(
                 f"{type(record).__name__} is no measurement record",
-                "give a TwoWayRange, OneWayRange, Velocity, Attitude, Depth or PositionFix",
+                "give a TwoWayRange, a Velocity or another record of ubl_graph.measurements",
             )
-        if isinstance(record, (TwoWayRange, OneWayRange)):
+        if isinstance(record, (TwoWayRange, OneWayRange, SlantRange)):
             self.setup.check_beacons(record)
+        if isinstance(record, (Heading, AngularRate, Odometry)):
+            self.setup.check_pose(record)
         if isinstance(record, Velocity):
             self.setup.check_current(record)
 

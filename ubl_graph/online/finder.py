@@ -12,6 +12,7 @@ from ubl_graph.online.buffer import ABSOLUTE, PINGS, Entry
 from ubl_graph.online.gate import REOPENS, Gate, distance, limit
 from ubl_graph.online.keeper import Keeper
 from ubl_graph.online.outputs import Event
+from ubl_graph.online.pose_gap import with_heading
 from ubl_graph.online.search import Found
 
 #: A track found first is put to the test so long after, s, and when the window is full.
@@ -65,6 +66,8 @@ class Finder(Keeper):
         """Begin without pings: fixes are linear, there is nothing to be looked for."""
         if any(self.tracker.buffer.of(kind) for kind in PINGS):
             return False
+        if self.setup.options.node != "point" and not self.guarded(self.tracker.begin_at_fixes):
+            return False
         moment = self.guarded(lambda: self.tracker.solved_at(now))
         if moment is None or not moment.covariance[:2, :2].diagonal().max() < FREE_SIGMA**2:
             return False
@@ -85,7 +88,8 @@ class Finder(Keeper):
         if not 0.0 < sigma < 1e4:
             return None
         east, north, up = moment.mean[:3] + dt * moment.mean[3:]
-        return Start(now, float(east), float(north), float(up), sigma)
+        start = Start(now, float(east), float(north), float(up), sigma)
+        return start if moment.rotation is None else with_heading(start, moment, dt)
 
     def confirm(self, now: float) -> None:
         """Put a young or ambiguous track to the test: a search may find a better one."""

@@ -11,15 +11,17 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from statistics import median
+from typing import Any
 
 import numpy as np
 from scipy.special import chdtri
 
 from ubl_graph.arrays import FloatArray
-from ubl_graph.graph import ODOMETRY_PSD
+from ubl_graph.builder import ODOMETRY_PSD
 from ubl_graph.online.buffer import Entry
 
 #: Share of good records that a gate refuses: five standard deviations.
@@ -37,7 +39,12 @@ TURN_RATE, TURN = 0.5, 0.1
 #: Velocities and attitudes are not compared over longer than this, s.
 COMPARED = 30.0
 
-_LIMITS = {dof: math.sqrt(chdtri(dof, REFUSED_SHARE)) for dof in (1, 2, 3)}
+#: The same of a turning rate, rad/s^2, and what odometry's noise is in a step, m.
+TURN_CHANGE, SPEED_CHANGE = 0.5, 0.1
+
+#: Components of what sensors of motion say.
+_COMPONENTS = {"velocity": 3, "attitude": 3, "heading": 1, "angular_rate": 3, "odometry": 6}
+_LIMITS = {dof: math.sqrt(chdtri(dof, REFUSED_SHARE)) for dof in (1, 2, 3, 4, 6)}
 
 
 def limit(dof: int) -> float:
@@ -148,20 +155,42 @@ class Gate:
 
 
 def step_distance(entry: Entry, before: Entry) -> tuple[float, int]:
-    """How far a velocity or attitude is from the sensor's last one: distance and components."""
-    dt = abs(entry.t - before.t)
+    """How far a record of motion is from the sensor's last one: distance and components."""
+    dt, values, old = abs(entry.t - before.t), entry.values, before.values
+    dof = _COMPONENTS[entry.kind]
     if dt > COMPARED:
-        return 0.0, 3
+        return 0.0, dof
+    if entry.kind == "odometry":
+        return _odometry_step(values, old, dt), dof
+    at = {"velocity": 4, "attitude": 4, "heading": 2, "angular_rate": 4}[entry.kind]
+    gap = [a - b for a, b in zip(values[1 : 1 + dof], old[1 : 1 + dof], strict=True)]
+    noise = values[at] ** 2 + old[at] ** 2
     if entry.kind == "velocity":
-        variance = entry.values[4] ** 2 + before.values[4] ** 2 + ODOMETRY_PSD * dt
-        gap = [a - b for a, b in zip(entry.values[1:4], before.values[1:4], strict=True)]
+        variance = noise + ODOMETRY_PSD * dt
+    elif entry.kind == "angular_rate":
+        variance = noise + (TURN_CHANGE * dt) ** 2 + TURN**2
     else:
-        variance = entry.values[4] ** 2 + before.values[4] ** 2 + (TURN_RATE * dt) ** 2 + TURN**2
-        gap = [
-            math.remainder(a - b, 2.0 * math.pi)
-            for a, b in zip(entry.values[1:4], before.values[1:4], strict=True)
+        gap = [math.remainder(g, 2.0 * math.pi) for g in gap]
+        variance = noise + (TURN_RATE * dt) ** 2 + TURN**2
+    return math.sqrt(sum(g * g for g in gap) / variance), dof
+
+
+def _odometry_step(values: Sequence[Any], old: Sequence[Any], dt: float) -> float:
+    """The distance of two changes of pose, as speeds and turning rates, each in its own axes."""
+    spans = [v[1] - v[0] for v in (values, old)]
+    total = 0.0
+    for own, density, least in (
+        (slice(2, 5), ODOMETRY_PSD, SPEED_CHANGE),
+        (slice(5, 8), TURN_CHANGE**2 * dt, TURN),
+    ):
+        rates = [
+            [(c or 0.0) / span for c in v[own]]
+            for v, span in zip((values, old), spans, strict=True)
         ]
-    return math.sqrt(sum(g * g for g in gap) / variance), 3
+        gap = sum((a - b) ** 2 for a, b in zip(*rates, strict=True))
+        noise = sum((least / min(span, 1.0)) ** 2 for span in spans)
+        total += gap / (density * dt + noise)
+    return math.sqrt(total)
 
 
 def distance(gap: FloatArray, covariance: FloatArray) -> float:

@@ -182,7 +182,8 @@ class Isam2Engine:
             options = window.frame.setup.options
             psd = (options.horizontal_psd, options.vertical_psd)
             problem = Problem(window.layout, tuple(blocks), window.loss, psd)
-            for factor in _factors(GraphView(problem, OFFSET + window.first).graph(frozen)):
+            view = GraphView(problem, OFFSET + window.first, charts=True)
+            for factor in _factors(view.graph(frozen)):
                 graph.add(factor)
             held += [_Held(e, -1) for e in come]
         return held
@@ -201,7 +202,7 @@ class _View:
         psd = (options.horizontal_psd, options.vertical_psd)
         self._layout = window.layout
         self._graph_view = GraphView(
-            Problem(self._layout, (), window.loss, psd), OFFSET + window.first
+            Problem(self._layout, (), window.loss, psd), OFFSET + window.first, charts=True
         )
         self.keys = keys_of(self._layout, OFFSET + window.first)
 

@@ -18,14 +18,19 @@ from ubl_graph.errors import DataError
 from ubl_graph.io.tables import did_you_mean, shortened
 from ubl_graph.measurements import (
     MAX_DISTANCE,
+    AngularRate,
     Attitude,
     Depth,
+    Heading,
+    Odometry,
     OneWayRange,
     PositionFix,
+    SlantRange,
     TwoWayRange,
     Velocity,
+    odometry_covariance,
 )
-from ubl_graph.mission import Setup, Start
+from ubl_graph.mission import RECORD_KINDS, Setup, Start
 from ubl_graph.records import MAX_TIME, Records
 
 if TYPE_CHECKING:
@@ -57,16 +62,30 @@ _GEODETIC = Form(("t", "latitude", "longitude"), ("height", "sigma"))
 FORMS: dict[str, Form] = {
     "two_way_range": Form(("beacon", "t_transmit", "t_receive"), ("travel_time", "sigma")),
     "one_way_range": Form(("beacon", "t_transmit", "t_receive"), ("sigma",)),
+    "slant_range": Form(("t", "beacon", "distance"), ("sigma",)),
     "velocity": Form(("t", "forward", "right", "down"), ("sigma", "reference")),
     "attitude": Form(("t", "heading"), ("pitch", "roll", "sigma")),
+    "heading": Form(("t", "heading"), ("sigma",)),
+    "angular_rate": Form(("t", "about_down"), ("about_forward", "about_right", "sigma")),
+    "odometry": Form(
+        ("t_from", "t_to", "forward", "right", "about_down"),
+        (*Odometry.SPATIAL, "sigma", "sigma_turn"),
+    ),
     "depth": Form(("t", "depth"), ("sigma",)),
     "position": Form(("t", "east", "north"), ("up", "sigma")),
     "query": Form((), ("t",)),
     "health": Form(),
     "reset": Form(),
-    "set_position": Form(("t", "east", "north"), ("up", "sigma")),
+    "set_position": Form(("t", "east", "north"), ("up", "sigma", "heading", "heading_sigma")),
 }
 _WORDS = frozenset({"type", "beacon", "reference"})
+#: Columns that are angles, or angles per second, by kind of record.
+_ANGLES: dict[type[Records], tuple[str, ...]] = {
+    Attitude: ("heading", "pitch", "roll", "sigma"),
+    Heading: ("heading", "sigma"),
+    AngularRate: ("about_forward", "about_right", "about_down", "sigma"),
+    Odometry: ("about_forward", "about_right", "about_down"),
+}
 
 
 def kind_of(content: dict[str, Any]) -> str:
@@ -249,14 +268,77 @@ def _velocity(content: dict[str, Any], setup: Setup) -> Velocity:  # noqa: ARG00
     return Velocity(**numbers_of(content), reference=reference)
 
 
-def _attitude(content: dict[str, Any], setup: Setup) -> Attitude:  # noqa: ARG001 - one form for all
+def _slant_range(content: dict[str, Any], setup: Setup) -> SlantRange:
+    return SlantRange(beacon=_beacon(content, setup).name, **numbers_of(content))
+
+
+def _in_radians(kind: type[Records], content: dict[str, Any]) -> dict[str, Any]:
+    """Numbers of an object whose angles are degrees, in SI."""
     values = numbers_of(content)
-    t = values.pop("t")
-    for name in values:
-        low, high, _ = Attitude.LIMITS[name]
-        _between(values, name, math.degrees(low), math.degrees(high), "degrees")
-    angles: dict[str, Any] = {name: math.radians(value) for name, value in values.items()}
-    return Attitude(t, **angles)
+    for name in _ANGLES[kind]:
+        if name in values:
+            low, high, unit = kind.LIMITS[name]
+            unit = unit.replace("rad", "degrees")
+            _between(values, name, math.degrees(low), math.degrees(high), unit)
+            values[name] = math.radians(values[name])
+    return values
+
+
+def heading_of(values: dict[str, Any]) -> dict[str, float]:
+    """Take a heading and its sigma, degrees, out of the numbers of a position that was set.
+
+    Parameters
+    ----------
+    values : dict
+        By key; the two are taken out.
+
+    Returns
+    -------
+    dict of str to float
+        The two in radians, as far as they are there.
+
+    Raises
+    ------
+    DataError
+        Where one is out of its limits, or the sigma stands alone; it names the key.
+    """
+    limits = {"heading": (-720.0, 720.0), "heading_sigma": (1e-6, 180.0)}
+    taken = {name: values.pop(name) for name in limits if name in values}
+    for name, bounds in limits.items():
+        _between(taken, name, *bounds, "degrees")
+    if "heading" not in taken and taken:
+        raise DataError("the sigma of no heading", "give the heading, too", field="heading_sigma")
+    return {name: math.radians(value) for name, value in taken.items()}
+
+
+def _attitude(content: dict[str, Any], setup: Setup) -> Attitude:  # noqa: ARG001 - one form for all
+    return Attitude(**_in_radians(Attitude, content))
+
+
+def _heading(content: dict[str, Any], setup: Setup) -> Heading:  # noqa: ARG001 - one form for all
+    return Heading(**_in_radians(Heading, content))
+
+
+def _angular_rate(content: dict[str, Any], setup: Setup) -> AngularRate:  # noqa: ARG001 - one form for all
+    return AngularRate(**_in_radians(AngularRate, content))
+
+
+def _odometry(content: dict[str, Any], setup: Setup) -> Odometry:  # noqa: ARG001 - one form for all
+    values = _in_radians(Odometry, content)
+    planar = not any(name in values for name in Odometry.SPATIAL)
+    if not planar:
+        values.update({name: values.get(name, 0.0) for name in Odometry.SPATIAL})
+    limits = {"sigma": (1e4, "m"), "sigma_turn": (180.0, "degrees")}
+    if limits.keys() & values.keys():
+        for name, (high, unit) in limits.items():
+            if name not in values:
+                raise DataError(
+                    "the key is missing", "sigma and sigma_turn stand together", field=name
+                )
+            _between(values, name, 1e-6, high, unit)
+        way, turn = (values.pop(name) for name in limits)
+        values["covariance"] = odometry_covariance(way, math.radians(turn), 2 if planar else 3)
+    return Odometry(**values)
 
 
 def _depth(content: dict[str, Any], setup: Setup) -> Depth:  # noqa: ARG001 - one form for all
@@ -288,19 +370,16 @@ def _position(content: dict[str, Any], setup: Setup) -> PositionFix:
 _MEASUREMENTS: dict[str, Callable[[dict[str, Any], Setup], Records]] = {
     "two_way_range": _two_way_range,
     "one_way_range": _one_way_range,
+    "slant_range": _slant_range,
     "velocity": _velocity,
     "attitude": _attitude,
+    "heading": _heading,
+    "angular_rate": _angular_rate,
+    "odometry": _odometry,
     "depth": _depth,
     "position": _position,
 }
-_TYPES: dict[type[Records], str] = {
-    TwoWayRange: "two_way_range",
-    OneWayRange: "one_way_range",
-    Velocity: "velocity",
-    Attitude: "attitude",
-    Depth: "depth",
-    PositionFix: "position",
-}
+_TYPES: dict[type[Records], str] = {made: kind for kind, (made, _) in RECORD_KINDS.items()}
 
 
 def record_content(record: Records | Start) -> dict[str, Any]:
@@ -315,19 +394,29 @@ def record_content(record: Records | Start) -> dict[str, Any]:
     -------
     dict
         `type` and the keys of that type; angles in degrees. A fix that has a covariance matrix
-        shows it as `covariance`, m^2, row by row.
+        shows it as `covariance`, m^2, row by row; so does odometry (m^2, m rad, rad^2), unless
+        `sigma` and `sigma_turn` say all of it.
     """
     if isinstance(record, Start):
-        stated = {"type": "set_position", **asdict(record)}
+        stated: dict[str, Any] = {"type": "set_position", **asdict(record)}
+        heading, sigma = stated.pop("heading"), stated.pop("heading_sigma")
+        if heading is not None:
+            stated["heading"], stated["heading_sigma"] = math.degrees(heading), math.degrees(sigma)
         return {key: value for key, value in stated.items() if value is not None}
     content: dict[str, Any] = {"type": _TYPES[type(record)]}
     for f in fields(record):
         value = getattr(record, f.name)
         if f.name == "source" or value is None:
             continue
-        if isinstance(record, Attitude) and f.name != "t":
+        if f.name in _ANGLES.get(type(record), ()):
             value = np.rad2deg(value)
         content[f.name] = value[0].tolist()
     if "covariance" in content:
-        del content["sigma"]
+        content.pop("sigma", None)
+    if isinstance(record, Odometry) and record.covariance is not None:
+        ways, sigmas = record.dimension, np.sqrt(np.diagonal(record.covariance[0]))
+        way, turn = float(sigmas[0]), float(sigmas[-1])
+        if np.array_equal(odometry_covariance(way, turn, ways), record.covariance):
+            del content["covariance"]
+            content["sigma"], content["sigma_turn"] = way, math.degrees(turn)
     return content

@@ -111,7 +111,7 @@ class Keeper:
         sigma = self.tracker.horizontal_sigma
         if sigma <= LOST_LEAST:
             return False
-        return not sigma <= max(LOST_LEAST, LOST_SHARE * self._reach(window.x[-1, :3]))
+        return not sigma <= max(LOST_LEAST, LOST_SHARE * self._reach(window.last_position))
 
     def _reach(self, position: FloatArray | None) -> float:
         """Distance to the beacons, m: by the position, but no farther than the pings say."""

@@ -13,13 +13,16 @@ from ubl_graph.factors.odometry import longest_gap_of
 from ubl_graph.factors.ranges import RangeBlock
 from ubl_graph.mission import Setup
 from ubl_graph.nodes import grid, grid_spacing, slot_of
-from ubl_graph.online.buffer import PINGS, Buffer, Entry
+from ubl_graph.online.buffer import HELD, PINGS, Buffer, Entry
 from ubl_graph.online.engines import Context, engine_of
 from ubl_graph.online.equations import Point, WindowEquations
-from ubl_graph.online.rows import Break, Frame, frame_of
+from ubl_graph.online.frame import Break, Frame, frame_of
 from ubl_graph.online.window import RowsOf, Window
+from ubl_graph.pose_states import COMPASS_SIGMA
 from ubl_graph.solve.banded import BandedFactor
 
+#: Kinds of records that bring unknowns along where nodes are poses.
+POSE_KINDS = ("attitude", "heading", "angular_rate", "odometry")
 #: Acoustic metres per second, for words and widths.
 METRES = 1500.0
 #: Nodes are kept longer than the lag while pings bend too much, but so many at the most.
@@ -123,7 +126,7 @@ class Ledger:
         self._velocities += entry.kind == "velocity"
         self._learn(entry)
         if self.window is None:
-            if entry.kind in ("attitude", "depth"):
+            if entry.kind in ("attitude", "depth", "heading", "angular_rate"):
                 return
             first = slot_of(entry.begin, self.spacing)
             self.window = Window(self._frame(), self.buffer, first)
@@ -139,12 +142,12 @@ class Ledger:
         window = self.window
         if window is None or entry.kind in PINGS:
             return
-        begin = end = entry.t
-        if entry.kind in ("velocity", "attitude"):
+        begin, end = entry.begin, entry.t
+        if entry.kind in HELD:
             before, after = self.buffer.neighbours(entry)
             begin = entry.t if before is None else before.t
             end = entry.t if after is None else after.t
-            if entry.kind == "attitude":
+            if entry.kind != "velocity":
                 # It is held where there is none before or after it.
                 begin = window.begin if before is None else begin
                 end = window.end if after is None else end
@@ -156,9 +159,12 @@ class Ledger:
     def _learn(self, entry: Entry) -> None:
         """Take in the unknowns that a new kind of record asks for."""
         before = len(self.kinds)
-        if entry.kind == "one_way_range":
+        posed = self.setup.options.node != "point"
+        if entry.kind == "one_way_range" or (posed and entry.kind in POSE_KINDS):
             self.kinds.add(entry.kind)
-        if entry.kind in ("velocity", "attitude") and self.buffer.of("attitude"):
+        if posed and entry.kind == "velocity":
+            self.kinds.add(entry.values[-1])
+        elif entry.kind in ("velocity", "attitude") and self.buffer.of("attitude"):
             if entry.kind == "velocity":
                 self.kinds.add(entry.values[-1])
             elif not {"bottom", "water"} & self.kinds:
@@ -170,6 +176,8 @@ class Ledger:
     def _frame(self) -> Frame:
         entries = self.buffer.of("attitude")
         lasting = float(np.median([e.values[4] for e in entries])) if entries else 0.0
+        if not entries and self.setup.options.node != "point" and self.buffer.of("heading"):
+            lasting = COMPASS_SIGMA
         if self.window is not None and self.window.frame.lasting > 0.0:
             lasting = self.window.frame.lasting
         return frame_of(self.setup, self.kinds, lasting, self._gap(), self.spacing)
@@ -195,6 +203,7 @@ class Ledger:
         back = grid(slot - window.first, window.first - slot, self.spacing)
         earlier.x[: len(back)] = window.predicted(window.x[0], back)
         earlier.x[len(back) :] = window.x
+        earlier.up[:] = np.concatenate([np.repeat(window.up[:1], len(back)), window.up])
         earlier.common = window.common
         self.window = earlier
         self._forget()
@@ -349,6 +358,9 @@ class Ledger:
 
 def _straightness(entry: Entry) -> float:
     """Twice the range times its standard deviation, m^2."""
+    if entry.kind == "slant_range":
+        distance, sigma = entry.values[2:4]
+        return 2.0 * max(distance, 10.0) * sigma
     legs = 2.0 if entry.kind == "two_way_range" else 1.0
     flight = abs(entry.values[3]) if legs == 2.0 else abs(entry.values[2] - entry.values[1])
     reach = max(METRES * flight / legs, 10.0)

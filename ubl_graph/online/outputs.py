@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -12,6 +12,7 @@ from ubl_graph.arrays import FloatArray
 from ubl_graph.mission import Start
 from ubl_graph.online.health import Status
 from ubl_graph.online.state import Moment
+from ubl_graph.pose_trajectory import mariners_angles, mariners_slopes
 from ubl_graph.records import Records
 
 
@@ -75,6 +76,11 @@ class Estimate:
         initialising, ok, coasting, degraded, ambiguous, lost or rebuilt.
     reasons : tuple of str
         Why the status is not ok.
+    rotation : array, shape (3, 3), or None
+        `world_R_body`, body forward-left-up to east-north-up; where nodes are poses.
+    pose_covariance : array, shape (6, 6), or None
+        Translation first, world axes: east, north, up (m), then the rotation about east, north and
+        up (rad).
     """
 
     t: float
@@ -83,6 +89,21 @@ class Estimate:
     covariance: FloatArray | None
     status: Status
     reasons: tuple[str, ...] = ()
+    rotation: FloatArray | None = None
+    pose_covariance: FloatArray | None = None
+
+    @property
+    def attitude(self) -> FloatArray | None:
+        """Heading clockwise from true north, pitch bow up, roll starboard down, (3,), rad."""
+        return None if self.rotation is None else mariners_angles(self.rotation[None])[0]
+
+    @property
+    def heading_sigma(self) -> float | None:
+        """Standard deviation of the heading, rad."""
+        if self.rotation is None or self.pose_covariance is None:
+            return None
+        slope = mariners_slopes(self.rotation[None])[0, 0]
+        return float(np.sqrt(slope @ self.pose_covariance[3:, 3:] @ slope))
 
 
 @dataclass
@@ -115,11 +136,16 @@ class Memory:
         self.confirm = [t + by for t in self.confirm]
         self.notes = {note: until + by for note, until in self.notes.items()}
         if self.moment is not None:
-            self.moment = Moment(self.moment.t + by, self.moment.mean, self.moment.covariance)
+            self.moment = replace(self.moment, t=self.moment.t + by)
 
 
 def sound(moment: Moment) -> bool:
     """Whether a moment holds finite numbers and a covariance that is one."""
-    if not (np.isfinite(moment.mean).all() and np.isfinite(moment.covariance).all()):
+    held = (moment.mean, moment.covariance, moment.rotation, moment.pose_covariance)
+    if not all(np.isfinite(part).all() for part in held if part is not None):
         return False
-    return bool((moment.covariance.diagonal() > 0.0).all())
+    diagonal = moment.covariance.diagonal()
+    if moment.rotation is not None:
+        # What a planar vehicle is held at has no variance.
+        return bool((diagonal >= 0.0).all() and (diagonal[[0, 1, 3, 4]] > 0.0).all())
+    return bool((diagonal > 0.0).all())

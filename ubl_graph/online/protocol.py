@@ -11,10 +11,12 @@ import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import numpy as np
+
 from ubl_graph.errors import DataError, UblGraphError
 from ubl_graph.io.tables import shortened
-from ubl_graph.measurements import OneWayRange, PositionFix, TwoWayRange
-from ubl_graph.online.json_records import kind_of, numbers_of, record_of, shown
+from ubl_graph.measurements import OneWayRange, PositionFix, SlantRange, TwoWayRange
+from ubl_graph.online.json_records import heading_of, kind_of, numbers_of, record_of, shown
 from ubl_graph.records import Records
 
 if TYPE_CHECKING:
@@ -45,12 +47,13 @@ class Measurement:
     @property
     def locates(self) -> bool:
         """Whether it is a ping or a position fix, which an estimate answers."""
-        return isinstance(self.record, (TwoWayRange, OneWayRange, PositionFix))
+        return isinstance(self.record, (TwoWayRange, OneWayRange, SlantRange, PositionFix))
 
     @property
     def t(self) -> float:
-        """When it was measured; a ping, when it was heard, s."""
-        name = "t_receive" if hasattr(self.record, "t_receive") else "t"
+        """When it was measured; a ping, when it was heard; odometry, when it ended, s."""
+        names = ("t", "t_receive", "t_to")
+        name = next(name for name in names if hasattr(self.record, name))
         return float(getattr(self.record, name)[0])
 
 
@@ -64,7 +67,7 @@ class Query:
 
 @dataclass(frozen=True)
 class SetPosition:
-    """A line that says where the vehicle is; `values` are the estimator's arguments (s, m)."""
+    """A line that says where the vehicle is; `values` are the estimator's arguments (SI)."""
 
     values: dict[str, float]
     came: dict[str, Any]
@@ -191,8 +194,9 @@ def _message(content: Any, setup: Setup) -> Message:
     if kind == "query":
         return Query(values.get("t"), content)
     if kind == "set_position":
+        heading = heading_of(values)
         PositionFix(**values)  # the same limits hold
-        return SetPosition(values, content)
+        return SetPosition(values | heading, content)
     return Reset(content) if kind == "reset" else HealthRequest(content)
 
 
@@ -220,6 +224,13 @@ def estimate_content(estimate: Estimate, asked: float | None = None) -> dict[str
     for names, vector in axes.items():
         numbers = [None] * 3 if vector is None else vector.tolist()
         content.update(zip(names, numbers, strict=True))
+    if estimate.rotation is not None:
+        assert estimate.attitude is not None
+        assert estimate.pose_covariance is not None
+        angles = np.rad2deg(estimate.attitude).tolist()
+        content.update(zip(("heading", "pitch", "roll"), angles, strict=True))
+        content["heading_sigma"] = float(np.rad2deg(estimate.heading_sigma or 0.0))
+        content["pose_covariance"] = estimate.pose_covariance.ravel().tolist()
     covariance = estimate.covariance
     content["covariance"] = None if covariance is None else covariance.ravel().tolist()
     content["status"] = estimate.status

@@ -10,10 +10,10 @@ from ubl_graph.arrays import FloatArray
 from ubl_graph.mission import Start
 from ubl_graph.nodes import slot_of
 from ubl_graph.online.buffer import Entry
+from ubl_graph.online.frame import Break
 from ubl_graph.online.gate import distance, limit
 from ubl_graph.online.ledger import MARGIN, METRES
-from ubl_graph.online.lm import minimise
-from ubl_graph.online.rows import Break
+from ubl_graph.online.pose_search import is_headed, seeded
 from ubl_graph.online.search import Found, placed, search
 from ubl_graph.online.tracker import STEPS_AFAR, Tracker
 from ubl_graph.solve.rounds import GRADUATION
@@ -39,6 +39,16 @@ class Reviser(Tracker):
         assert window is not None
         begin = max(window.begin, window.end - self.spacing - self.lag - MARGIN)
         return search(self.setup, self.buffer, self.spacing, begin, start)
+
+    def begin_at_fixes(self) -> bool:
+        """Put poses where fixes and a heading reference say; False where the heading is unknown."""
+        window = self._refreshed()
+        if not is_headed(self.buffer):
+            return False
+        window.put(seeded(window, self.buffer))
+        window.touch_all()
+        self._forget()
+        return True
 
     def adopt(self, found: Found, anew: bool = False) -> bool:
         """Go on from a found track where that fits better than the present one; whether it did.
@@ -108,8 +118,7 @@ class Reviser(Tracker):
         saved, breaks = window.vector, dict(window.breaks)
         begin = max(min(e.t for e in marks), window.begin)
         slot = max(slot_of(begin, self.spacing) - 1, window.first)
-        sizes = [float(np.linalg.norm(self._fix_gap(e)[0])) for e in marks]
-        window.breaks[slot] = Break(max(LEAST_STEP, STEP_FACTOR * max(sizes)))
+        window.breaks[slot] = self._jump_to_marks(marks)
         window.touch(slot * self.spacing, slot * self.spacing)
         for entry in marks:
             self.regate(entry, False)
@@ -129,14 +138,26 @@ class Reviser(Tracker):
         self._forget()
         return False
 
+    def _jump_to_marks(self, marks: Sequence[Entry]) -> Break:
+        """The jump that takes the vehicle to where fixes, or someone, say that it is."""
+        far, turned = LEAST_STEP, Break.rotation
+        for entry in marks:
+            gap = self._fix_gap(entry)[0]
+            headed = isinstance(entry.record, Start) and entry.record.heading is not None
+            if headed:
+                gap, turned = gap[:-1], max(turned, STEP_FACTOR * abs(float(gap[-1])))
+            far = max(far, STEP_FACTOR * float(np.linalg.norm(gap)))
+        return Break(far, rotation=turned)
+
     def _from_afar(self, x: FloatArray) -> FloatArray:
         """Approach the window's least cost from the loss' convex side, all pings counted."""
         window = self._refreshed()
         with self._opened():
             context = self._context(window)
-        for width in GRADUATION:
-            context.equations.frozen = [width * b.frozen(x) for b in context.ranges]
-            x = minimise(context.equations, x, STEPS_AFAR).x
+            for width in GRADUATION:
+                context.equations.frozen = [width * b.frozen(x) for b in context.ranges]
+                context, point = self._settled(window, context, x, STEPS_AFAR, self._plainly)
+                x = point.x
         return x
 
     @staticmethod

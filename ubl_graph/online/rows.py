@@ -1,128 +1,35 @@
 """Residual rows of grid intervals: what the records between two nodes say of these two nodes.
 
-A linear row touches the two nodes of the interval that its record falls into, and what all nodes
-share. So intervals can be made anew one by one when a late record comes, by the same builder that
-makes a whole mission's problem. The range rows, which are not linear, are not here.
+A row touches the two nodes of the interval that its record falls into, and what all nodes share. So
+intervals can be made anew one by one when a late record comes, by the same builder that makes a
+whole mission's problem. Those of points are linear, those of poses are linearised where the nodes
+stand. The range rows are not here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
 
 from ubl_graph.arrays import FloatArray, IntArray
 from ubl_graph.attitude import AttitudeTrack
+from ubl_graph.builder import Builder, SegmentModel
 from ubl_graph.factors.block import Block, LinearBlock
 from ubl_graph.factors.odometry import Preintegration
-from ubl_graph.graph import Builder, SegmentModel, shared_states
 from ubl_graph.layout import KINEMATIC, Chain, Layout
-from ubl_graph.mission import Segment, Setup
-from ubl_graph.nodes import grid, order_of
+from ubl_graph.mission import Segment
+from ubl_graph.nodes import grid
 from ubl_graph.online.buffer import Buffer, columns_of, fixes_of
-from ubl_graph.trajectory import Order, transition
+from ubl_graph.online.frame import Break, Frame
+from ubl_graph.online.pose_rows import CONSTANT_SPAN, jump_block, linearised, pose_blocks
+from ubl_graph.trajectory import transition
 
-#: Time over which a slow state that does not walk counts as constant, s.
-CONSTANT_SPAN = 3600.0
+#: Blocks that speak of nodes one by one.
+NODE_BLOCKS = ("velocity", "water velocity", "attitude", "rate")
 #: The attitude of a vehicle that has not told it, and whose sensors do not ask for it.
 LEVEL = AttitudeTrack(None)
-
-
-@dataclass(frozen=True)
-class Break:
-    """Where the vehicle may have jumped: standard deviations of the step between two nodes.
-
-    Attributes
-    ----------
-    position, velocity, acceleration : float
-        m, m/s, m/s^2.
-    """
-
-    position: float
-    velocity: float = 1.0
-    acceleration: float = 0.1
-
-
-@dataclass(frozen=True)
-class Frame:
-    """What the unknowns of a window are, wherever it stands.
-
-    Attributes
-    ----------
-    setup : Setup
-        Beacons, vehicle, options.
-    spacing : float
-        Of the grid of nodes, s.
-    order : 2 or 3
-        Of the motion prior.
-    slow, shared : tuple of (str, int)
-        Names and sizes of the slow states at the nodes, and of what all nodes share.
-    lasting : float
-        Standard deviation of the heading reference's lasting error, rad.
-    gap : float
-        Velocities farther apart than this do not join, s.
-    """
-
-    setup: Setup
-    spacing: float
-    order: Order
-    slow: tuple[tuple[str, int], ...]
-    shared: tuple[tuple[str, int], ...]
-    lasting: float
-    gap: float
-
-    @property
-    def width(self) -> int:
-        """Columns of a node."""
-        return 3 * self.order + sum(size for _, size in self.slow)
-
-    @property
-    def border(self) -> int:
-        """Columns that all nodes share."""
-        return sum(size for _, size in self.shared)
-
-    @property
-    def interval(self) -> int:
-        """Columns that an interval's rows touch: two nodes, and what they share."""
-        return 2 * self.width + self.border
-
-    def layout(self, times: FloatArray) -> Layout:
-        """The layout of nodes at some times."""
-        return Layout((Chain("", 0, times),), self.order, self.slow, self.shared)
-
-
-def frame_of(
-    setup: Setup, kinds: Iterable[str], lasting: float, gap: float, spacing: float
-) -> Frame:
-    """The unknowns that the kinds of records seen so far ask for.
-
-    Parameters
-    ----------
-    setup : Setup
-        Options and beacons.
-    kinds : iterable of str
-        Record kinds; "water" and "bottom" for velocities.
-    lasting : float
-        Standard deviation of the heading reference's lasting error, rad.
-    gap : float
-        Longest gap that velocities bridge, s.
-    spacing : float
-        Of the nodes, s.
-    """
-    seen = set(kinds)
-    options = setup.options
-    slow: list[tuple[str, int]] = []
-    if options.estimate_sound_speed and setup.beacons:
-        slow.append(("sound_speed", 1))
-    if "one_way_range" in seen:
-        slow += [("clock_offset", 1), ("clock_drift", 1)]
-    if "water" in seen:
-        slow.append(("current", 2))
-    odometry = bool({"water", "bottom"} & seen)
-    shared = shared_states(setup, lasting if odometry else None)
-    return Frame(setup, spacing, order_of(options), tuple(slow), shared, lasting, gap)
 
 
 def attitude_over(buffer: Buffer, begin: float, end: float) -> AttitudeTrack | None:
@@ -132,7 +39,12 @@ def attitude_over(buffer: Buffer, begin: float, end: float) -> AttitudeTrack | N
 
 
 def interval_rows(
-    frame: Frame, buffer: Buffer, first: int, count: int, breaks: Mapping[int, Break]
+    frame: Frame,
+    buffer: Buffer,
+    first: int,
+    count: int,
+    breaks: Mapping[int, Break],
+    x: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Rows of `count` neighbouring intervals from the interval number `first` on.
 
@@ -146,35 +58,41 @@ def interval_rows(
         Intervals; interval k lasts from k to k + 1 times the grid's spacing.
     breaks : mapping of int to Break
         Intervals in which the vehicle may have jumped.
+    x : array, shape ((count + 1) W + B,)
+        Where the nodes and what they share stand: rows of poses hold there.
 
     Returns
     -------
-    array, shape (count, C, C)
+    array, shape (count, H, C)
         Whitened rows over the columns of two nodes and of what is shared, padded with zeros.
-    array, shape (count, C)
+    array, shape (count, H)
         Their right-hand sides.
     """
-    if _silent(frame, buffer, first, count, breaks):
+    if not frame.is_posed and _silent(frame, buffer, first, count, breaks):
         rows, targets = _silent_rows(frame)
         return np.repeat(rows, count, axis=0), np.repeat(targets, count, axis=0)
-    times = grid(first, count + 1, frame.spacing)
-    layout = frame.layout(times)
-    builder = Builder(frame.setup, layout)
-    chain = layout.chains[0]
-    model, blocks = _modelled(frame, buffer, builder, chain)
-    blocks += builder.linear_blocks(chain, model, CONSTANT_SPAN)
-    kept = [_stacked(block, frame, count) for block in blocks if len(block.columns)]
+    layout = frame.layout(grid(first, count + 1, frame.spacing))
+    builder, chain = frame.builder(layout), layout.chains[0]
+    if frame.is_posed:
+        blocks = pose_blocks(frame, buffer, builder, chain)
+    else:
+        model, some = _modelled(frame, buffer, builder, chain)
+        blocks = some + builder.linear_blocks(chain, model, CONSTANT_SPAN)
+    linear = [linearised(block, x) for block in blocks if len(block.columns)]
+    kept = [_stacked(block, frame, count) for block in linear]
     broken = [k - first for k in breaks if first <= k < first + count]
     if broken:
-        drop = {"motion", "odometry", "water odometry"}
-        names = [block.name for block in blocks if len(block.columns)]
-        for at, (name, part) in enumerate(zip(names, kept, strict=True)):
-            if name in drop:
+        drop = {"motion", "odometry", "water odometry", "arrival"}
+        for at, (block, part) in enumerate(zip(linear, kept, strict=True)):
+            if block.name in drop:
                 stay = ~np.isin(part[0], broken)
                 kept[at] = part[0][stay], part[1][stay], part[2][stay]
-        kept += [_stacked(_jump(layout, k, breaks[k + first]), frame, count) for k in broken]
+        for k in broken:
+            make = jump_block if frame.is_posed else _jump
+            jump: Block = make(frame, layout, k, breaks[k + first])
+            kept.append(_stacked(linearised(jump, x), frame, count))
     owner, rows, targets = (np.concatenate(part) for part in zip(*kept, strict=True))
-    return _compressed(owner, rows, targets, count)
+    return _compressed(owner, rows, targets, count, frame.height)
 
 
 def _silent(
@@ -193,12 +111,13 @@ def _silent(
 def _silent_rows(frame: Frame) -> tuple[FloatArray, FloatArray]:
     """Rows of one interval in which nothing was measured."""
     layout = frame.layout(np.array([0.0, frame.spacing]))
-    builder = Builder(frame.setup, layout)
+    builder = Builder(frame.setup, layout, frame.lasting)
     model = SegmentModel(Segment(), layout.chains[0].t, LEVEL, None, None)
     blocks = builder.linear_blocks(layout.chains[0], model, CONSTANT_SPAN)
-    kept = [_stacked(block, frame, 1) for block in blocks if len(block.columns)]
+    none = np.zeros(layout.size)
+    kept = [_stacked(linearised(b, none), frame, 1) for b in blocks if len(b.columns)]
     owner, rows, targets = (np.concatenate(part) for part in zip(*kept, strict=True))
-    return _compressed(owner, rows, targets, 1)
+    return _compressed(owner, rows, targets, 1, frame.height)
 
 
 def _modelled(
@@ -221,7 +140,8 @@ def _modelled(
     vehicle = frame.setup.vehicle
     if attitude is not None or vehicle.antenna.is_zero:
         blocks += [builder.fix_block(chain, rows, track) for rows in fixes_of(inside["position"])]
-    blocks += [builder.start_block(chain, e.record) for e in inside["set_position"]]  # pyright: ignore[reportArgumentType]
+    for entry in inside["set_position"]:
+        blocks += builder.start_blocks(chain, entry.record)  # pyright: ignore[reportArgumentType]
     depth = None
     if inside["depth"] and (attitude is not None or vehicle.depth_sensor.is_zero):
         depth = columns_of("depth", inside["depth"])
@@ -234,7 +154,9 @@ def _modelled(
                 columns_of("velocity", rows), track, psd, frame.gap
             )
     segment = Segment(depth=depth)
-    return SegmentModel(segment, chain.t, track, **by_reference), blocks
+    return SegmentModel(
+        segment, chain.t, track, by_reference["bottom"], by_reference["water"]
+    ), blocks
 
 
 def _known(frame: Frame, reference: str) -> bool:
@@ -242,13 +164,12 @@ def _known(frame: Frame, reference: str) -> bool:
     return reference == "bottom" or "current" in dict(frame.slow)
 
 
-def _jump(layout: Layout, k: int, jump: Break) -> LinearBlock:
-    """The motion over one interval, all but free."""
+def _jump(frame: Frame, layout: Layout, k: int, jump: Break) -> LinearBlock:
+    """The motion of a point over one interval, all but free."""
     names = KINEMATIC[: layout.order]
     node = np.array([k])
     sides = [layout.node_columns(name, node + end) for end in (0, 1) for name in names]
-    dt = layout.chains[0].t[k + 1] - layout.chains[0].t[k]
-    phi = np.kron(transition(layout.order, dt)[0], np.eye(3))
+    phi = np.kron(transition(layout.order, frame.spacing)[0], np.eye(3))
     sigma = np.repeat([getattr(jump, name) for name in names], 3)
     matrix = np.concatenate([-phi, np.eye(len(phi))], axis=1) / sigma[:, None]
     return LinearBlock(
@@ -256,13 +177,14 @@ def _jump(layout: Layout, k: int, jump: Break) -> LinearBlock:
     )
 
 
-def _stacked(block: Block, frame: Frame, count: int) -> tuple[IntArray, FloatArray, FloatArray]:
+def _stacked(
+    block: LinearBlock, frame: Frame, count: int
+) -> tuple[IntArray, FloatArray, FloatArray]:
     """A linear block's rows over local columns: owner (R,), rows (R, C), right-hand sides (R,)."""
-    assert isinstance(block, LinearBlock)
     width, inner = frame.width, (count + 1) * frame.width
     columns, matrix, target = block.columns, block.matrix, block.target
     nodes = np.where((columns >= 0) & (columns < inner), columns // width, count + 1).min(axis=1)
-    if block.name in ("velocity", "water velocity"):
+    if block.name in NODE_BLOCKS:
         # The last node's own rows are the next interval's.
         stay = nodes < count
         columns, matrix, target, nodes = columns[stay], matrix[stay], target[stay], nodes[stay]
@@ -283,15 +205,15 @@ def triangle(rows: FloatArray) -> FloatArray:
 
 
 def _compressed(
-    owner: IntArray, rows: FloatArray, targets: FloatArray, count: int
+    owner: IntArray, rows: FloatArray, targets: FloatArray, count: int, height: int
 ) -> tuple[FloatArray, FloatArray]:
-    """At most as many rows as columns for each interval, by QR; the same least squares."""
+    """At most `height` rows for each interval, by QR; the same least squares."""
     size = rows.shape[1]
-    out, right = np.zeros((count, size, size)), np.zeros((count, size))
+    out, right = np.zeros((count, height, size)), np.zeros((count, height))
     for k in range(count):
         own = owner == k
         some = np.column_stack([rows[own], targets[own]])
         if len(some) > size:
-            some = triangle(some)[:size]
+            some = triangle(some)[:height]
         out[k, : len(some)], right[k, : len(some)] = some[:, :-1], some[:, -1]
     return out, right

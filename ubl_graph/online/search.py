@@ -11,8 +11,13 @@ from ubl_graph.errors import UblGraphError
 from ubl_graph.layout import KINEMATIC
 from ubl_graph.measurements import PositionFix
 from ubl_graph.mission import Mission, Segment, Setup, Start
-from ubl_graph.online.buffer import PINGS, Buffer, Entry, columns_of, fixes_of
+from ubl_graph.nodes import grid, slot_of
+from ubl_graph.online.buffer import PINGS, Buffer, Entry, columns_of, fixes_of, odometry_of
+from ubl_graph.online.grid_odometry import on_grid
+from ubl_graph.online.pose_search import put_track, turned_with
+from ubl_graph.online.pose_state import poses_of, put_poses
 from ubl_graph.online.window import Window
+from ubl_graph.pose_trajectory import PoseTrajectory
 from ubl_graph.result import Result
 from ubl_graph.smoother import smooth
 
@@ -54,6 +59,8 @@ class Found:
         if len(track.t) > 1:
             velocity = np.gradient(segment.rival, track.t, axis=0)
         mirrored = replace(track, position=segment.rival, velocity=velocity)
+        if isinstance(track, PoseTrajectory) and isinstance(mirrored, PoseTrajectory):
+            mirrored = replace(mirrored, rotation=turned_with(track, velocity))
         segments = (replace(segment, trajectory=mirrored), *self.result.segments[1:])
         return replace(self, result=replace(self.result, segments=segments))
 
@@ -88,6 +95,10 @@ def search(
     """
     segment = _segment(setup, buffer, begin, start)
     options = replace(setup.options, node_spacing=spacing, solver="banded")
+    if setup.options.node != "point":
+        segment = _posed(segment, setup, buffer, spacing, begin)
+        # What was laid onto the grid holds the options' noise already.
+        options = replace(options, odometry_noise="given")
     try:
         mission = Mission((segment,), setup.beacons, setup.sound_speed, setup.vehicle, options)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -115,7 +126,7 @@ def _segment(setup: Setup, buffer: Buffer, begin: float, start: Start | None) ->
         if some:
             parts[kind] = columns_of(kind, some)
     vehicle = setup.vehicle
-    if "attitude" not in parts:
+    if "attitude" not in parts and setup.options.node == "point":
         parts.pop("velocity", None)
         if not vehicle.depth_sensor.is_zero:
             parts.pop("depth", None)
@@ -123,9 +134,30 @@ def _segment(setup: Setup, buffer: Buffer, begin: float, start: Start | None) ->
     if start is None and marks and isinstance(marks[-1], Start):
         start = marks[-1]
     fixes = _horizontal([e for e in buffer.of("position") if not e.gated and e.t >= begin])
-    if fixes is not None and ("attitude" in parts or vehicle.antenna.is_zero):
+    bare = setup.options.node != "point" or vehicle.antenna.is_zero
+    if fixes is not None and ("attitude" in parts or bare):
         parts["position"] = fixes
     return Segment(start=start, **parts)  # pyright: ignore[reportArgumentType]
+
+
+def _posed(segment: Segment, setup: Setup, buffer: Buffer, spacing: float, begin: float) -> Segment:
+    """A segment with what only poses can use; odometry is laid onto the grid of nodes."""
+    heading, rates = (
+        [e for e in buffer.of(kind) if not e.gated and e.t >= begin - 1e-9]
+        for kind in ("heading", "angular_rate")
+    )
+    steps = [e for e in buffer.of("odometry") if not e.gated and e.begin >= begin - 1e-9]
+    odometry = None
+    if steps:
+        first = slot_of(steps[0].begin, spacing)
+        times = grid(first, slot_of(steps[-1].t, spacing) + 2 - first, spacing)
+        odometry = on_grid(odometry_of(steps), times, setup.options)
+    return replace(
+        segment,
+        heading=columns_of("heading", heading) if heading else None,
+        angular_rate=columns_of("angular_rate", rates) if rates else None,
+        odometry=odometry,
+    )
 
 
 def _horizontal(entries: list[Entry]) -> PositionFix | None:
@@ -157,14 +189,21 @@ def placed(window: Window, found: Found, first_node: int | None = None) -> Float
     segment = found.result.segments[0]
     track = segment.trajectory
     layout, frame = window.layout, window.frame
-    first = round(float(track.t[0]) / frame.spacing) - window.first
-    at = np.clip(np.arange(window.count) - first, 0, len(track.t) - 1)
     vector = window.vector
-    states = {"position": track.position, "velocity": track.velocity}
-    if track.acceleration is not None:
-        states["acceleration"] = track.acceleration
-    for name in KINEMATIC[: frame.order]:
-        layout.put(vector, name, states[name][at])
+    nodes = vector[: window.count * frame.width].reshape(window.count, -1)
+    if isinstance(track, PoseTrajectory):
+        # Nodes that odometry joins stand where its records end.
+        at = np.abs(track.t[None] - window.times[:, None]).argmin(axis=1)
+        beyond = put_track(window, nodes, track)
+    else:
+        first = round(float(track.t[0]) / frame.spacing) - window.first
+        at = np.clip(np.arange(window.count) - first, 0, len(track.t) - 1)
+        states = {"position": track.position, "velocity": track.velocity}
+        if track.acceleration is not None:
+            states["acceleration"] = track.acceleration
+        for name in KINEMATIC[: frame.order]:
+            layout.put(vector, name, states[name][at])
+        beyond = (np.arange(window.count, dtype=np.float64) - first - at) * frame.spacing
     for name, slow in segment.slow.items():
         if layout.has(name):
             layout.put(vector, name, slow.value[at])
@@ -172,10 +211,10 @@ def placed(window: Window, found: Found, first_node: int | None = None) -> Float
     for name, shared in known.items():
         if layout.has(name):
             layout.put(vector, name, shared.value)
-    beyond = (np.arange(window.count, dtype=np.float64) - first - at) * frame.spacing
-    nodes = vector[: window.count * frame.width].reshape(window.count, -1)
     for k in np.flatnonzero(beyond):
         nodes[k] = window.predicted(nodes[k], beyond[k : k + 1])[0]
+    if frame.is_posed:
+        put_poses(frame, nodes, poses_of(frame, nodes, window.up), window.x)
     if first_node is not None:
         nodes[: first_node - window.first] = window.x[: first_node - window.first]
     return vector

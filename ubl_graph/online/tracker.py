@@ -5,24 +5,27 @@ It knows nothing of clocks, time-outs and outputs; that is the estimator's busin
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
 
 from ubl_graph.arrays import FloatArray
+from ubl_graph.builder import SegmentModel
 from ubl_graph.factors.ranges import RangeBlock
-from ubl_graph.mission import Start
-from ubl_graph.online.buffer import PINGS, Entry
+from ubl_graph.mission import Segment, Start
+from ubl_graph.online.buffer import PINGS, Entry, columns_of
 from ubl_graph.online.engines import Context
 from ubl_graph.online.equations import Point
 from ubl_graph.online.gate import distance, limit
 from ubl_graph.online.ledger import Ledger, Solved
 from ubl_graph.online.lm import minimise
-from ubl_graph.online.rows import attitude_over
+from ubl_graph.online.pose_gap import place_of, pose_gap
+from ubl_graph.online.rows import LEVEL, attitude_over
 from ubl_graph.online.state import Moment, moment_at, tail_covariance, trajectory_of
 from ubl_graph.online.window import Window
+from ubl_graph.pose_trajectory import PoseStates
 from ubl_graph.solve.banded import BandedFactor
 from ubl_graph.solve.rounds import GRADUATION
 from ubl_graph.trajectory import Trajectory
@@ -35,8 +38,13 @@ STEPS_AFAR = 60
 WIDE = 20.0
 #: A standard deviation that takes a row out of the equations, as a multiple of its own.
 MUTED = 1e9
+#: Rows of poses are made anew so often in a solve at the most; steps that would raise the cost by
+#: more than this are halved so often.
+ROUNDS, SLACK, HALVINGS = 12, 0.05, 6
 #: After so many velocities their pace is looked at again.
 LOOK_AT_PACE = 20
+
+Solver = Callable[[Window, Context, FloatArray, int], Point]
 
 
 class Tracker(Ledger):
@@ -71,6 +79,17 @@ class Tracker(Ledger):
         if window.is_touched:
             # Only linear rows have changed: one step is all but exact, and the solve goes on.
             x = x + factor.solve(-context.equations.gradient(point))
+            for _ in range(ROUNDS):
+                if not self._relinearised(x):
+                    break
+                # Those of poses are linear only where they were made.
+                context = self._context(window, x)
+                frozen = context.equations.frozen
+                context.equations.frozen = muted
+                point = context.equations.evaluate(x)
+                factor = context.equations.factor(point)
+                x = x + factor.solve(-context.equations.gradient(point))
+                context.equations.frozen = frozen
             window.put(x)
             # What was solved last stands elsewhere now; nothing may be linearised by it.
             self._solved = self._factor = None
@@ -89,12 +108,12 @@ class Tracker(Ledger):
         self.horizontal_sigma = float(np.sqrt(np.linalg.eigvalsh(last[:2, :2])[-1]))
         return abs(float(r)) / np.sqrt(self._spread), 1
 
-    def _context(self, window: Window) -> Context:
-        """Rows and equations of all pings that count."""
+    def _context(self, window: Window, x: FloatArray | None = None) -> Context:
+        """Rows and equations of all pings that count; `x`: where they are looked at."""
         pings = window.usable()
         ranges = window.ranges(pings)
         equations = window.equations(ranges)
-        x = window.vector
+        x = window.vector if x is None else x
         equations.frozen = [b.frozen(x) for b in ranges]
         return Context(window.first, self.version, pings, ranges, equations)
 
@@ -108,14 +127,17 @@ class Tracker(Ledger):
         return distance(gap, covariance), len(gap)
 
     def _fix_gap(self, entry: Entry) -> tuple[FloatArray, FloatArray]:
-        """From the track as it was solved last to a fix: gap (d,), m, and its covariance."""
+        """From the track as it was solved last to a fix: gap (d,), m, and its covariance.
+
+        Where a heading was set, too, its gap (rad) is the last component.
+        """
         moment = self.moment(entry.t)
         self.horizontal_sigma = float(np.sqrt(np.linalg.eigvalsh(moment.covariance[:2, :2])[-1]))
+        if moment.rotation is not None:
+            return pose_gap(entry, moment, self.setup)
         lever = np.zeros(3)
         if isinstance(entry.record, Start):
-            start = entry.record
-            known = [start.east, start.north] + ([] if start.up is None else [start.up])
-            place, covariance = np.array(known), start.sigma**2 * np.eye(len(known))
+            place, covariance = place_of(entry.record)
         else:
             place, covariance = entry.values[1][0], entry.values[2][0]
             track = attitude_over(self.buffer, entry.t, entry.t)
@@ -139,18 +161,68 @@ class Tracker(Ledger):
         judged, self._judging = self._judging, None
         if judged is None or judged.version != self.version:
             judged = self._context(window)
-        context = judged
-        equations, x = context.equations, window.vector
+        context, x = judged, window.vector
         if afar and context.ranges:
-            frozen = equations.frozen
+            frozen = context.equations.frozen
             for width in GRADUATION:
-                equations.frozen = [width * held for held in frozen]
-                x = minimise(equations, x, STEPS_AFAR).x
-            equations.frozen = [b.frozen(x) for b in context.ranges]
+                context.equations.frozen = [width * held for held in frozen]
+                context, point = self._settled(window, context, x, STEPS_AFAR, self._plainly)
+                x = point.x
+            context.equations.frozen = [b.frozen(x) for b in context.ranges]
             context = replace(context, start=None)
-        point = self._engine.solve(window, context, x, STEPS_AFAR if afar else STEPS)
+        most = STEPS_AFAR if afar else STEPS
+        context, point = self._settled(window, context, x, most, self._engine.solve)
         window.put(point.x)
         self._keep(context, point)
+
+    def _settled(
+        self, window: Window, context: Context, x: FloatArray, most: int, solver: Solver
+    ) -> tuple[Context, Point]:
+        """Solve, with the rows of poses made anew until these stay where they were made.
+
+        Steps that would raise the cost are halved. What was solved comes with the answer.
+        """
+        if not window.frame.is_posed:
+            return context, solver(window, context, x, most)
+        if self._relinearised(x):
+            context = self._renewed(window, context)
+        least = context.equations.evaluate(x, jacobian=False).cost
+        for _ in range(ROUNDS):
+            point = solver(window, context, x, most)
+            if not self._relinearised(point.x):
+                return context, point
+            context = self._renewed(window, context)
+            goal, cost = point.x, context.equations.evaluate(point.x, jacobian=False).cost
+            for _ in range(HALVINGS):
+                if cost <= least + SLACK:
+                    break
+                goal = 0.5 * (x + goal)
+                self._relinearised(goal)
+                context = self._renewed(window, context)
+                cost = context.equations.evaluate(goal, jacobian=False).cost
+            x, least = goal, min(cost, least)
+        return context, context.equations.evaluate(x)
+
+    def _relinearised(self, x: FloatArray) -> bool:
+        """Make anew the rows of poses that `x` has left; whether there are any."""
+        window = self.window
+        assert window is not None
+        changed = window.relinearise(x)
+        if changed:
+            self._engine.note(changed)
+            self.version += 1
+        return bool(changed)
+
+    def _renewed(self, window: Window, context: Context) -> Context:
+        """The same with the window's rows as they are now."""
+        equations = window.equations(context.ranges)
+        equations.frozen = context.equations.frozen
+        return replace(context, version=self.version, equations=equations, start=None)
+
+    @staticmethod
+    def _plainly(window: Window, context: Context, x: FloatArray, most: int) -> Point:  # noqa: ARG004 - as engines
+        """Minimise, whatever the engine."""
+        return minimise(context.equations, x, most)
 
     def _keep(self, context: Context, point: Point) -> None:
         window = self.window
@@ -165,7 +237,8 @@ class Tracker(Ledger):
             ranges = window.ranges(window.usable())
             equations = window.equations(ranges)
             equations.frozen = [b.frozen(x) for b in ranges]
-            point = minimise(equations, x, STEPS_AFAR)
+            context = Context(window.first, self.version, window.usable(), ranges, equations)
+            _, point = self._settled(window, context, x, STEPS_AFAR, self._plainly)
         return point.cost, point.x
 
     def _refreshed(self) -> Window:
@@ -179,6 +252,7 @@ class Tracker(Ledger):
                 window.regap(gap)
         if window.is_dirty:
             self._engine.note(window.refresh())
+        self._relinearised(window.vector)
         return window
 
     @property
@@ -220,7 +294,8 @@ class Tracker(Ledger):
             self._factor = solved.equations.factor(solved.point)
         last = solved.first + solved.equations.nodes - 1
         ends = window.x[last - 1 - window.first : last + 1 - window.first]
-        return moment_at(window.frame, self._factor, ends, last * self.spacing, t)
+        up = window.up[last - 1 - window.first : last + 1 - window.first]
+        return moment_at(window.frame, self._factor, ends, up, last * self.spacing, t)
 
     def moment(self, t: float) -> Moment:
         """Position and velocity at `t` (s), in the window or ahead of it."""
@@ -228,11 +303,15 @@ class Tracker(Ledger):
         assert window is not None
         factor = self.factor()
         if t >= window.end - self.spacing:
-            return moment_at(window.frame, factor, window.x[-2:], window.end, t)
+            ends, up = window.x[-2:], window.up[-2:]
+            return moment_at(window.frame, factor, ends, up, window.end, t)
         states = trajectory_of(window, factor).at(max(t, window.begin))
         covariance = np.zeros((6, 6))
         covariance[:3, :3], covariance[3:, 3:] = states.covariance[0], states.velocity_covariance[0]
-        return Moment(t, np.concatenate([states.position[0], states.velocity[0]]), covariance)
+        mean = np.concatenate([states.position[0], states.velocity[0]])
+        if isinstance(states, PoseStates):
+            return Moment(t, mean, covariance, states.rotation[0], states.pose_covariance[0])
+        return Moment(t, mean, covariance)
 
     def trajectory(self) -> Trajectory:
         """The whole window with covariances."""
@@ -293,6 +372,13 @@ class Tracker(Ledger):
             if track is None:
                 return []
         layout = window.layout
+        if window.frame.is_posed:
+            builder = window.frame.builder(layout)
+            segment = Segment(depth=columns_of("depth", some))
+            model = SegmentModel(segment, window.times, LEVEL, None, None)
+            rows = builder.depth_blocks(layout.chains[0], model)
+            values = rows[0].evaluate(window.vector, jacobian=False)[0][:, 0] if rows else []
+            return [(e, float(r)) for e, r in zip(some, values, strict=False)]
         at = layout.positions_at(layout.chains[0], times)
         up = (window.vector[at.columns[:, :, 2]] * at.weights).sum(axis=1)
         lever = np.zeros(len(times)) if track is None else track.lever(arm, times)[:, 2]

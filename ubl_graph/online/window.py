@@ -15,15 +15,18 @@ from typing import Any
 import numpy as np
 
 from ubl_graph.arrays import FloatArray, IntArray
+from ubl_graph.attitude import AttitudeTrack
 from ubl_graph.factors.block import Block, LinearBlock
 from ubl_graph.factors.loss import RobustLoss
 from ubl_graph.factors.ranges import RangeBlock
-from ubl_graph.graph import Builder
-from ubl_graph.layout import KINEMATIC, Layout
+from ubl_graph.layout import Layout
 from ubl_graph.nodes import grid, slot_of
 from ubl_graph.online.buffer import PINGS, Buffer, Entry, columns_of
 from ubl_graph.online.equations import LinearRows, WindowEquations
-from ubl_graph.online.rows import Break, Frame, attitude_over, interval_rows, triangle
+from ubl_graph.online.frame import Break, Frame
+from ubl_graph.online.pose_rows import linearised, tolerances
+from ubl_graph.online.pose_state import leap_block, moved_on, poses_of, put_poses
+from ubl_graph.online.rows import LEVEL, attitude_over, interval_rows, triangle
 from ubl_graph.trajectory import transition
 
 
@@ -66,6 +69,10 @@ class Window:
         Nodes' unknowns in the layout's units.
     common : array, shape (B,)
         What all nodes share.
+    up : array, shape (N,)
+        Where planar nodes are held, m; zero for others.
+    made_at : array, shape (N - 1, C)
+        Where the rows of each interval of poses were made: two nodes, and what they share.
     breaks : dict of int to Break
         Intervals in which the vehicle may have jumped.
     is_pristine : bool
@@ -79,7 +86,9 @@ class Window:
         self.is_pristine = True
         self.x = np.zeros((2, frame.width))
         self.common = np.zeros(frame.border)
-        self.linear = LinearRows(frame.width, frame.border)
+        self.up = np.zeros(2)
+        self.made_at = np.zeros((1, frame.interval))
+        self.linear = LinearRows(frame.width, frame.border, frame.height)
         self._dirty: set[int] = {first}
         self._touched = True
         self._prior, self._prior_target = self._first_prior()
@@ -99,9 +108,29 @@ class Window:
         window = cls(frame, buffer, first)
         window.linear.append(len(x) - 2)
         window.x, window.common, window.count = x, common, len(x)
+        window.up = np.zeros(len(x))
+        window.made_at = np.zeros((len(x) - 1, frame.interval))
         window._prior, window._prior_target = prior
         window.touch_all()
         return window
+
+    def restore_poses(self, up: FloatArray, made_at: FloatArray, dirty: Iterable[int]) -> None:
+        """Put planar nodes where they were held, and rows of poses where they were made.
+
+        Parameters
+        ----------
+        up : array, shape (N,)
+            m.
+        made_at : array, shape (N - 1, C)
+            As the attribute.
+        dirty : iterable of int
+            Intervals that waited for their rows.
+        """
+        self.up = up
+        for k, stands in enumerate(made_at):
+            made = interval_rows(self.frame, self._buffer, self.first + k, 1, self.breaks, stands)
+            self.linear.put(slice(k, k + 1), *made)
+        self.made_at, self._dirty = made_at, set(dirty)
 
     # -- what it is --
 
@@ -123,7 +152,14 @@ class Window:
     @property
     def layout(self) -> Layout:
         """Columns of the nodes as they are now."""
-        return self.frame.layout(self.times)
+        return self.frame.layout(self.times, self.up)
+
+    @property
+    def last_position(self) -> FloatArray:
+        """East, north, up of the last node, (3,), m."""
+        if self.frame.is_planar:
+            return np.array([*self.x[-1, :2], self.up[-1]])
+        return self.x[-1, :3]
 
     @property
     def vector(self) -> FloatArray:
@@ -145,6 +181,11 @@ class Window:
     def is_dirty(self) -> bool:
         """Whether intervals wait for their rows."""
         return bool(self._dirty)
+
+    @property
+    def dirty(self) -> list[int]:
+        """Numbers of the intervals that wait for their rows."""
+        return sorted(self._dirty)
 
     @property
     def is_first_dirty(self) -> bool:
@@ -179,20 +220,27 @@ class Window:
         last = self.first + self.count - 1
         dt = grid(1, more, self.frame.spacing)
         self.x = np.concatenate([self.x, self.predicted(self.x[-1], dt)])
+        self.up = np.concatenate([self.up, np.repeat(self.up[-1:], more)])
+        self.made_at = np.concatenate([self.made_at, np.zeros((more, self.frame.interval))])
         self.linear.append(more)
         self._dirty.update(range(last, last + more))
         self.count += more
 
     def predicted(self, node: FloatArray, dt: FloatArray) -> FloatArray:
         """A node's unknowns (W,) carried ahead by times `dt` (M,), s: (M, W)."""
-        return node @ np.swapaxes(self.carried(dt), 1, 2)
+        out = node @ np.swapaxes(self.carried(dt), 1, 2)
+        if self.frame.is_posed:
+            some = np.repeat(node[None], len(dt), axis=0)
+            poses = poses_of(self.frame, some, np.zeros(len(dt)))
+            put_poses(self.frame, out, moved_on(poses, dt), None)
+        return out
 
     def carried(self, dt: FloatArray) -> FloatArray:
         """Transition of a node's unknowns over times `dt` (M,), s: (M, W, W)."""
         frame, n = self.frame, self.frame.order
         out = np.broadcast_to(np.eye(frame.width), (len(dt), frame.width, frame.width)).copy()
         phi = transition(n, dt)
-        for axis in range(3):
+        for axis in range(0 if frame.is_posed else 3):
             own = axis + 3 * np.arange(n)
             out[:, own[:, None], own[None, :]] = phi
         slow = dict(frame.slow)
@@ -205,15 +253,59 @@ class Window:
             out[:, offset, drift] = dt * layout.unit("clock_drift") / layout.unit("clock_offset")
         return out
 
-    def refresh(self) -> set[int]:
-        """Make the rows of changed intervals anew; which they were."""
+    def refresh(self, x: FloatArray | None = None) -> set[int]:
+        """Make the rows of changed intervals anew; which they were.
+
+        Rows of poses are made where the flat vector `x` stands, or else the window.
+        """
         changed = set(self._dirty)
+        if not changed:
+            return changed
+        x = self.vector if x is None else x
+        self._hold_up()
+        w, inner = self.frame.width, self.count * self.frame.width
         for begin, count in _runs(self._dirty):
-            rows, targets = interval_rows(self.frame, self._buffer, begin, count, self.breaks)
-            at = slice(begin - self.first, begin - self.first + count)
+            low = begin - self.first
+            stands = np.concatenate([x[low * w : (low + count + 1) * w], x[inner:]])
+            rows, targets = interval_rows(
+                self.frame, self._buffer, begin, count, self.breaks, stands
+            )
+            at = slice(low, low + count)
             self.linear.put(at, rows, targets)
+            self.made_at[at] = self._ends(x)[at]
         self._dirty.clear()
         return changed
+
+    def relinearise(self, x: FloatArray) -> set[int]:
+        """Make anew the rows of poses that the flat vector `x` has left; which they were."""
+        if not self.frame.is_posed:
+            return set()
+        w = self.frame.width
+        place = 2 if self.frame.is_planar else 3
+        strayed = self._ends(x) - self.made_at
+        strayed[:, w : w + place] -= strayed[:, :place]
+        strayed[:, :place] = 0.0
+        far = (np.abs(strayed) > tolerances(self.frame)).any(axis=1)
+        self._dirty.update(self.first + np.flatnonzero(far))
+        return self.refresh(x)
+
+    def _ends(self, x: FloatArray) -> FloatArray:
+        """Each interval's two nodes, and what they share, out of a flat vector: (N - 1, C)."""
+        inner = self.count * self.frame.width
+        nodes = x[:inner].reshape(self.count, -1)
+        shared = np.broadcast_to(x[inner:], (self.count - 1, self.frame.border))
+        return np.concatenate([nodes[:-1], nodes[1:], shared], axis=1)
+
+    def _hold_up(self) -> None:
+        """Hold planar nodes where the depth sensor says."""
+        depths = [e for e in self._buffer.of("depth") if not e.gated]
+        if not self.frame.is_planar or not depths:
+            return
+        t, depth = np.array([e.values[:2] for e in depths]).T
+        arm = self.frame.setup.vehicle.depth_sensor.body[2]
+        fresh = self.times >= t[0]
+        fresh |= self.is_pristine
+        self.up[fresh] = -np.interp(self.times[fresh], t, depth) - arm
 
     def drop(self, pings: Sequence[RowsOf]) -> None:
         """Eliminate the first node.
@@ -241,7 +333,7 @@ class Window:
         rest = triangle(np.concatenate(stacked))[w:size, w:]
         self._prior, self._prior_target = rest[:, :-1], rest[:, -1]
         self.first, self.count = self.first + 1, self.count - 1
-        self.x = self.x[1:]
+        self.x, self.up, self.made_at = self.x[1:], self.up[1:], self.made_at[1:]
         self.linear.drop()
         self._dirty.discard(self.first - 1)
         self.breaks.pop(self.first - 1, None)
@@ -249,8 +341,13 @@ class Window:
     def leap(self, slot: int) -> None:
         """Carry the prior of a single node that is left to one far ahead, nothing in between."""
         frame, ahead = self.frame, (slot - self.first) * self.frame.spacing
+        start = self.predicted(self.x[0], np.array([ahead]))[0]
         layout = frame.layout(np.array([0.0, ahead]))
-        blocks = Builder(frame.setup, layout).silent_blocks(layout.chains[0])
+        blocks = frame.builder(layout).silent_blocks(layout.chains[0])
+        if frame.is_posed:
+            ends, up = np.stack([self.x[0], start]), np.repeat(self.up[:1], 2)
+            blocks = [block for block in blocks if block.linear]
+            blocks.append(leap_block(frame, ends, up, ahead))
         w, size = frame.width, layout.size
         prior = np.zeros((len(self._prior), size + 1))
         prior[:, :w], prior[:, 2 * w : size] = self._prior[:, :w], self._prior[:, w:]
@@ -258,10 +355,10 @@ class Window:
         rows = [_dense(block, size) for block in blocks]
         rest = triangle(np.concatenate([prior, *rows]))[w:size, w:]
         self._prior, self._prior_target = rest[:, :-1], rest[:, -1]
-        start = self.predicted(self.x[0], np.array([ahead]))[0]
         self.first, self.count = slot, 2
+        self.up, self.made_at = np.repeat(self.up[:1], 2), np.zeros((1, frame.interval))
         self.x = np.stack([start, self.predicted(start, np.array([frame.spacing]))[0]])
-        self.linear = LinearRows(frame.width, frame.border)
+        self.linear = LinearRows(frame.width, frame.border, frame.height)
         self.breaks.clear()
         self._dirty = {slot}
 
@@ -277,7 +374,7 @@ class Window:
         old_x, old_prior, old_target = self.vector, self._prior, self._prior_target
         old_nodes = (old_prior.shape[1] - self.frame.border) // self.frame.width
         vector = np.zeros(after.size)
-        names = [*KINEMATIC[: frame.order], *(name for name, _ in self.frame.slow)]
+        names = [name for name, _ in (*before.kinematic, *self.frame.slow)]
         for name in (*names, *(name for name, _ in self.frame.shared)):
             after.put(vector, name, before.get(old_x, name))
         first, shared = (
@@ -299,8 +396,9 @@ class Window:
             stacked = triangle(stacked)[:size]
         self._prior, self._prior_target = stacked[:, :-1], stacked[:, -1]
         self.put(vector)
-        self.linear = LinearRows(frame.width, frame.border)
+        self.linear = LinearRows(frame.width, frame.border, frame.height)
         self.linear.append(self.count - 2)
+        self.made_at = np.zeros((self.count - 1, frame.interval))
         self.touch_all()
 
     def regap(self, gap: float) -> None:
@@ -313,20 +411,20 @@ class Window:
     def ranges(self, pings: Sequence[Entry]) -> list[RangeBlock]:
         """Residuals of pings, two-way and one-way, over the window's columns."""
         layout = self.layout
-        builder = Builder(self.frame.setup, layout)
+        builder = self.frame.builder(layout)
         out: list[RangeBlock] = []
         for kind in PINGS:
             some = [e for e in pings if e.kind == kind]
             if some:
                 records = columns_of(kind, some)
-                lever = self._levers(builder, some, records)
-                out.append(builder.range_block(layout.chains[0], records, lever))
+                attitude = self._attitude_of(some)
+                out.append(builder.range_block(layout.chains[0], records, attitude))
         return out
 
     def usable(self) -> list[Entry]:
         """Pings that count: inside the window, not gated, with an attitude where that is needed."""
-        waits = not self.frame.setup.vehicle.transducer.is_zero and not self._buffer.of("attitude")
-        if waits:
+        bare = self.frame.is_posed or self.frame.setup.vehicle.transducer.is_zero
+        if not bare and not self._buffer.of("attitude"):
             return []
         begin, end = self.begin - 1e-9, self.end + 1e-9
         return [
@@ -347,7 +445,8 @@ class Window:
         """The rows of the interval after node number `k` as a block over the window's columns."""
         at, w = k - self.first, self.frame.width
         columns = np.concatenate([at * w + np.arange(2 * w), self._shared_columns()])
-        rows, targets = self.linear.rows[at], self.linear.targets[at]
+        size = self.frame.interval
+        rows, targets = self.linear.rows[at, :size], self.linear.targets[at, :size]
         return LinearBlock("interval", columns[None], rows[None], targets[None])
 
     def prior_row(self) -> LinearBlock:
@@ -362,21 +461,20 @@ class Window:
 
     # -- inside --
 
-    def _levers(self, builder: Builder, some: Sequence[Entry], records: object) -> FloatArray:
-        """Transducer's lever arms in world axes."""
-        legs = 2 if some[0].kind == "two_way_range" else 1
-        if self.frame.setup.vehicle.transducer.is_zero:
-            return np.zeros((len(some), legs, 3))
+    def _attitude_of(self, some: Sequence[Entry]) -> AttitudeTrack:
+        """Held attitude over some pings, for the transducer's lever arm."""
+        if self.frame.is_posed or self.frame.setup.vehicle.transducer.is_zero:
+            return LEVEL
         track = attitude_over(self._buffer, min(e.begin for e in some), max(e.t for e in some))
         assert track is not None
-        return builder.transducer_levers(track, records)  # pyright: ignore[reportArgumentType]
+        return track
 
     def _prior_blocks(self) -> list[LinearBlock]:
         """What is known of the first node and of what is shared before any measurement."""
-        builder = Builder(self.frame.setup, self.layout)
+        builder, x = self.frame.builder(self.layout), self.vector
         chain = self.layout.chains[0]
-        blocks = [*builder.first_priors(chain), *builder.shared_priors(self.frame.lasting)]
-        return [b for b in blocks if isinstance(b, LinearBlock)]
+        blocks = [*builder.first_priors(chain), *builder.shared_priors()]
+        return [linearised(b, x) for b in blocks]
 
     def _first_prior(self) -> tuple[FloatArray, FloatArray]:
         rows = np.concatenate([_embedded(b, self.layout, 1) for b in self._prior_blocks()])

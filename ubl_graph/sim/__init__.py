@@ -9,7 +9,15 @@
 """
 
 from ubl_graph.sim.cao2017 import SeaTrial, cao_pass, cao_sea_trial
-from ubl_graph.sim.missions import demo_survey, straight_pass
+from ubl_graph.sim.missions import (
+    DRIFTING,
+    PLANAR,
+    demo_survey,
+    drifting_heading,
+    planar_vehicle,
+    straight_pass,
+)
+from ubl_graph.sim.pose_sensors import compass, gyro, odometer
 from ubl_graph.sim.sensors import (
     Clock,
     DvlErrors,
@@ -19,6 +27,7 @@ from ubl_graph.sim.sensors import (
     fixes,
     one_way_pings,
     pressure,
+    slant_ranges,
     two_way_pings,
 )
 from ubl_graph.sim.tracks import (
@@ -32,6 +41,8 @@ from ubl_graph.sim.tracks import (
 from ubl_graph.sim.xue2024 import munk_profile, xue_pass, xue_track, xue_wandering
 
 __all__ = [
+    "DRIFTING",
+    "PLANAR",
     "Clock",
     "DvlErrors",
     "Sea",
@@ -40,16 +51,22 @@ __all__ = [
     "ahrs",
     "cao_pass",
     "cao_sea_trial",
+    "compass",
     "constant_acceleration",
     "constant_velocity",
     "demo_survey",
+    "drifting_heading",
     "dvl",
     "fixes",
+    "gyro",
     "lawn_mower",
     "munk_profile",
+    "odometer",
     "one_way_pings",
+    "planar_vehicle",
     "pressure",
     "sampled",
+    "slant_ranges",
     "straight_pass",
     "two_way_pings",
     "wander",

@@ -21,12 +21,14 @@ from ubl_graph.measurements import (
     ATTITUDE_SIGMA,
     DEPTH_SIGMA,
     POSITION_SIGMA,
+    SLANT_RANGE_SIGMA,
     TRAVEL_TIME_SIGMA,
     VELOCITY_SIGMA,
     Attitude,
     Depth,
     OneWayRange,
     PositionFix,
+    SlantRange,
     TwoWayRange,
     Velocity,
 )
@@ -262,8 +264,10 @@ def ahrs(
     *,
     error: tuple[float, float, float] = (0.0, 0.0, 0.0),
     sigma: float = ATTITUDE_SIGMA,
+    rng: np.random.Generator | None = None,
+    white: float = 0.0,
 ) -> Attitude:
-    """Attitude with a constant error.
+    """Attitude with an error that lasts: the track's heading bias, and a constant one.
 
     Parameters
     ----------
@@ -275,10 +279,17 @@ def ahrs(
         Added to heading, pitch and roll, rad: a heading reference's error lasts.
     sigma : float
         Standard deviation of that error as the records state it, rad.
+    rng : numpy.random.Generator, optional
+        For white noise; left out, there is none.
+    white : float
+        Its standard deviation, rad, of each angle.
     """
     t = np.atleast_1d(np.asarray(times, dtype=np.float64))
-    angles = (truth.heading(t), truth.pitch(t), truth.roll(t))
-    heading, pitch, roll = (a + e for a, e in zip(angles, error, strict=True))
+    angles = np.stack([truth.heading(t) + truth.heading_bias(t), truth.pitch(t), truth.roll(t)])
+    angles = angles + np.array(error)[:, None]
+    if rng is not None:
+        angles = angles + white * rng.standard_normal(angles.shape)
+    heading, pitch, roll = angles
     return Attitude(t, heading, pitch, roll, sigma)
 
 
@@ -295,6 +306,26 @@ def pressure(
     t = np.atleast_1d(np.asarray(times, dtype=np.float64))
     up = truth.sensor_position(LeverArm() if arm is None else arm, t)[:, 2]
     return Depth(t, -up + noise * sigma * rng.standard_normal(len(t)), sigma)
+
+
+def slant_ranges(
+    truth: Truth,
+    beacons: Sequence[Beacon],
+    times: ArrayLike,
+    rng: np.random.Generator,
+    *,
+    arm: LeverArm | None = None,
+    sigma: float = SLANT_RANGE_SIGMA,
+    noise: float = 1.0,
+) -> SlantRange:
+    """Distances to the beacons in turn, at times (M,), s; `sigma` in metres."""
+    t = np.atleast_1d(np.asarray(times, dtype=np.float64))
+    asked = [beacons[i % len(beacons)] for i in range(len(t))]
+    place = np.array([b.position for b in asked]).reshape(-1, 3)
+    antenna = truth.sensor_position(LeverArm() if arm is None else arm, t)
+    distance = np.linalg.norm(antenna - place, axis=1)
+    distance = distance + noise * sigma * rng.standard_normal(len(t))
+    return SlantRange(t, np.array([b.name for b in asked]), distance, sigma)
 
 
 def fixes(

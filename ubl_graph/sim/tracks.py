@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ubl_graph.arrays import ArrayLike, FloatArray
 from ubl_graph.errors import ConfigurationError, TimeError
@@ -30,7 +31,7 @@ Motion: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 Angle: TypeAlias = float | Callable[[FloatArray], FloatArray]
 Span: TypeAlias = tuple[float, float]
 
-#: Half the interval over which a lever arm's motion by rotation is differenced, s.
+#: Half the interval over which rotations are differenced, s.
 RATE_STEP = 1e-3
 
 
@@ -48,6 +49,8 @@ class Truth:
         Heading clockwise from north, rad; left out, it follows the course over ground.
     pitch_is, roll_is : float or callable
         Pitch (bow up) and roll (starboard down), rad.
+    heading_bias_is : float or callable
+        What its heading reference reads too far clockwise, rad.
     """
 
     span: Span
@@ -55,12 +58,17 @@ class Truth:
     heading_is: Angle | None = None
     pitch_is: Angle = 0.0
     roll_is: Angle = 0.0
+    heading_bias_is: Angle = 0.0
 
     def with_attitude(
         self, heading: Angle | None = None, pitch: Angle = 0.0, roll: Angle = 0.0
     ) -> Truth:
         """Return the same motion under other angles, rad; no heading means the course."""
         return replace(self, heading_is=heading, pitch_is=pitch, roll_is=roll)
+
+    def with_heading_bias(self, bias: Angle) -> Truth:
+        """Return the same motion with a heading reference that reads so much too far, rad."""
+        return replace(self, heading_bias_is=bias)
 
     def position(self, t: ArrayLike) -> FloatArray:
         """East, north, up of the reference point at times (M,), shape (M, 3), m."""
@@ -86,6 +94,19 @@ class Truth:
         """Roll, starboard down, at times (M,), rad."""
         return _angle(self.roll_is, self._times(t))
 
+    def heading_bias(self, t: ArrayLike) -> FloatArray:
+        """What the heading reference reads too far clockwise at times (M,), rad."""
+        return _angle(self.heading_bias_is, self._times(t))
+
+    def angular_rate(self, t: ArrayLike) -> FloatArray:
+        """Angular rate about the body's forward, left and up axes at times (M,), (M, 3), rad/s.
+
+        By central difference over 2 ms; where the track begins to turn it is half of the turn's.
+        """
+        before, after = self._around(self._times(t))
+        turned = np.swapaxes(self.rotation(before), 1, 2) @ self.rotation(after)
+        return Rotation.from_matrix(turned).as_rotvec() / (after - before)[:, None]
+
     def rotation(self, t: ArrayLike) -> FloatArray:
         """`world_R_body` at times (M,), shape (M, 3, 3)."""
         return world_R_body(self.heading(t), self.pitch(t), self.roll(t))
@@ -101,8 +122,7 @@ class Truth:
         if arm.is_zero:
             return self.velocity(t)
         times = self._times(t)
-        before = np.maximum(times - RATE_STEP, self.span[0])
-        after = np.minimum(times + RATE_STEP, self.span[1])
+        before, after = self._around(times)
         turned = self.rotation(after) @ arm.body - self.rotation(before) @ arm.body
         return self.velocity(times) + turned / (after - before)[:, None]
 
@@ -110,6 +130,13 @@ class Truth:
         """Track of the reference point at times (M,), as missions carry it for comparison."""
         times = np.sort(self._times(t))
         return Reference(times, self.position(times))
+
+    def _around(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Times a little before and after, within the span."""
+        return (
+            np.maximum(times - RATE_STEP, self.span[0]),
+            np.minimum(times + RATE_STEP, self.span[1]),
+        )
 
     def _times(self, t: ArrayLike) -> FloatArray:
         times = np.atleast_1d(np.asarray(t, dtype=np.float64))

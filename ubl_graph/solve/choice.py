@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ubl_graph.errors import SolverError
+from ubl_graph.factors.poses import PoseMotion
 from ubl_graph.options import Solver
 from ubl_graph.problem import Problem
 from ubl_graph.solve.banded import BandedEngine
@@ -14,6 +15,9 @@ from ubl_graph.solve.rounds import Engine
 
 #: Up to so many nodes `auto` has GTSAM confirm the answer: it takes a second or less.
 GTSAM_NODES = 5000
+#: Rows of poses that are not GTSAM's own, up to which it does: each takes some tenths of a
+#: millisecond alone.
+GTSAM_POSE_ROWS = 4000
 #: Shared unknowns that the banded solver takes: its border is dense, each one costs a solve.
 MOST_SHARED = 64
 #: Entries of the band that fit: 2 GB, and as much again several times over for the solution. The
@@ -78,9 +82,19 @@ def choose(problem: Problem, solver: Solver) -> Choice:
             f"nodes, more than {MOST_SHARED}",
         )
     banded = BandedEngine(problem)
-    if solver == "auto" and problem.layout.node_count <= GTSAM_NODES:
+    few = problem.layout.node_count <= GTSAM_NODES and _pose_rows(problem) <= GTSAM_POSE_ROWS
+    if solver == "auto" and few:
         return Choice(banded, GtsamEngine(problem))
     return _alone(banded)
+
+
+def _pose_rows(problem: Problem) -> int:
+    """Rows of poses that GTSAM asks Python for."""
+    if problem.layout.node == "point":
+        return 0
+    native = PoseMotion if problem.layout.node == "pose3" else ()
+    own = (b for b in problem.blocks if not b.linear and not isinstance(b, native))
+    return sum(len(b.columns) for b in own)
 
 
 def _alone(engine: Engine, note: str = "") -> Choice:

@@ -23,7 +23,6 @@ import numpy as np
 
 from ubl_graph.arrays import BoolArray, FloatArray
 from ubl_graph.errors import SolverError
-from ubl_graph.factors.block import LinearBlock
 from ubl_graph.factors.loss import RobustLoss
 from ubl_graph.problem import Frozen, Problem
 from ubl_graph.solve.banded import BandedDescent, BandedFactor
@@ -162,8 +161,8 @@ def _log_whitening(problem: Problem, frozen: Frozen) -> float:
     """Sum over the rows of log det W."""
     total = 0.0
     for block, held in zip(problem.blocks, frozen, strict=True):
-        if isinstance(block, LinearBlock):
-            total += 0.0 if block.log_det is None else block.log_det()
-        elif held is not None:
+        if held is not None:
             total -= float(np.log(held).sum())
+        elif block.log_det is not None:
+            total += block.log_det()
     return total

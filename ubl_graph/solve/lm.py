@@ -64,7 +64,7 @@ class GtsamDescent:
 
     def __init__(self, view: GraphView, x: FloatArray, frozen: Frozen) -> None:
         self._view = view
-        self._graph = view.graph(frozen)
+        self._graph = view.graph(frozen, batched=True)
         try:
             self._optimizer = gtsam.LevenbergMarquardtOptimizer(
                 self._graph, view.values(x), parameters_of(view)

@@ -77,7 +77,7 @@ class Marginals:
         self.unresolved: BoolArray = np.zeros(layout.node_count, dtype=np.bool_)
         if found.doubtful:
             # What a larger ridge lowers, the ridge has made, or rounding has.
-            own = np.arange(3)
+            own = layout.node_columns("position", np.zeros(1, dtype=np.int64))[0]
             ridge = max(10.0 * found.ridge, DOUBTFUL_PIVOT)
             larger = _invert(equations, point, [ridge]).node[:, own, own].sum(axis=1)
             self.unresolved = larger < 0.5 * found.node[:, own, own].sum(axis=1)

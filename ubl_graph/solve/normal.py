@@ -178,7 +178,10 @@ class NormalEquations:
         store = self._store
         np.copyto(store, self._constant)
         for products, (_, jacobian) in zip(self._products, point.curved, strict=True):
-            products.add(store, _entries(jacobian))
+            if jacobian.shape[1] == 1:
+                products.add(store, _entries(jacobian))
+            else:
+                products.add_all(store, jacobian)
         return self.shape.split(store)
 
     @cached_property
@@ -258,6 +261,7 @@ class _Products:
             twice.append((pair + some.start, row))
         pair, self._row_twice = (np.concatenate(part) for part in zip(*twice, strict=True))
         self._a_twice, self._b_twice = self._a[pair], self._b[pair]
+        self._pa_twice, self._pb_twice = places[self._a_twice], places[self._b_twice]
         self._target_twice = self._target[pair, self._row_twice].astype(np.intp)
 
     def _portions(self) -> Iterator[slice]:
@@ -276,6 +280,21 @@ class _Products:
         again = entries[self._a_twice, row] * entries[self._b_twice, row]
         np.add.at(store, self._target_twice, again)
 
+    def add_all(self, store: FloatArray, jacobian: FloatArray) -> None:
+        """Add J'J of rows with several components, (M, R, C): those of one row are one product."""
+        size = max(1, CHUNK // max(len(self._a), 1))
+        for first in range(0, len(jacobian), size):
+            some = slice(first, first + size)
+            gram = np.swapaxes(jacobian[some], 1, 2) @ jacobian[some]
+            target = self._target[:, some].T.astype(np.intp)
+            np.add.at(store, target.ravel(), gram[:, self._a, self._b].ravel())
+        row = self._row_twice
+        if len(row):
+            again = (jacobian[row, :, self._pa_twice] * jacobian[row, :, self._pb_twice]).sum(
+                axis=1
+            )
+            np.add.at(store, self._target_twice, again)
+
 
 def _entries(jacobian: FloatArray) -> FloatArray:
     """(M, R, C) Jacobians as (R C, M), row by row contiguous."""
@@ -283,7 +302,7 @@ def _entries(jacobian: FloatArray) -> FloatArray:
 
 
 def _all_entries(block: Block) -> tuple[IntArray, IntArray]:
-    """Row and place of every entry of a block whose rows have one component."""
+    """Row and place of every entry of a block, whose components are added up beforehand."""
     width = block.columns.shape[1]
     return np.zeros(width, dtype=np.int64), np.arange(width)
 

@@ -1,16 +1,9 @@
-"""Frozen measurement records, one class per kind, columnar inside.
-
-A record class holds M measurements of one kind as arrays of length M; single numbers are taken
-as M = 1 and broadcast against arrays. All quantities are SI and radians, times are float64
-seconds since the mission's epoch. Whatever enters is checked here, at the door: a value that is
-not finite, negative where it must not be, or absurd raises a `DataError` that names the
-record, or the file, row and field it came from.
-"""
+"""Ranges: two-way pings, one-way broadcasts, and distances that a device reports."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -21,15 +14,12 @@ from ubl_graph.records import Records, Source, record_error
 MAX_TRAVEL_TIME = 60.0
 #: A travel time may exceed receive minus transmit time by so much (clock granularity), s.
 STAMP_TOLERANCE = 0.1
-#: Positions farther from the origin than this are not local, m.
-MAX_DISTANCE = 1e7
+#: No modem and no radio on a vehicle measures a longer range, m.
+MAX_RANGE = 1e5
 
 # One standard deviation of each kind where neither a column nor an option gives it.
 TRAVEL_TIME_SIGMA = 1e-4  #: s; modems and seafloor transponders reach 0.05 to 0.2 ms
-VELOCITY_SIGMA = 0.01  #: m/s; a 600 kHz DVL's single-ping noise
-ATTITUDE_SIGMA = float(np.deg2rad(0.2))  #: rad; a fibre-optic gyrocompass
-DEPTH_SIGMA = 0.1  #: m; a pressure sensor of 0.01 % of 1 000 m
-POSITION_SIGMA = 2.0  #: m; GNSS without corrections
+SLANT_RANGE_SIGMA = 1.0  #: m; what devices that report metres round and smooth away
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,192 +204,48 @@ class OneWayRange(Records):
 
 
 @dataclass(frozen=True, eq=False)
-class Velocity(Records):
-    """Velocity through the DVL's eyes, in the vehicle's axes.
+class SlantRange(Records):
+    """Distance to a beacon at one instant, as a modem or radio reports it in metres.
+
+    No travel time is known: the distance is taken as the length of the straight line between
+    transducer and beacon at `t`. A modem that reports slant ranges together with the times of ping
+    and reply says more; see `TwoWayRange.from_slant_range`.
 
     Parameters
     ----------
     t : float or array, shape (M,)
         Seconds.
-    forward, right, down : float or array, shape (M,)
-        m/s.
-    sigma : float or array, shape (M,), default 0.01
-        Standard deviation of each component, m/s, white from sample to sample.
-    reference : "bottom" or "water", or array of these, default "bottom"
-        What the velocity is relative to. Water-track needs the current as a state.
-    source : Source, optional
-        File and rows the records came from.
-    """
-
-    t: Any
-    forward: Any
-    right: Any
-    down: Any
-    sigma: Any = VELOCITY_SIGMA
-    reference: Any = "bottom"
-    source: Source | None = None
-
-    LIMITS: ClassVar = {
-        "forward": (-50.0, 50.0, "m/s"),
-        "right": (-50.0, 50.0, "m/s"),
-        "down": (-50.0, 50.0, "m/s"),
-        "sigma": (1e-6, 10.0, "m/s"),
-    }
-
-    def _check(self) -> None:
-        self._forbid(
-            ~np.isin(self.reference, ("bottom", "water")),
-            "reference",
-            self.reference,
-            " is neither 'bottom' nor 'water'",
-            "say which of the two",
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class Attitude(Records):
-    """Attitude from a heading reference, mariner's angles.
-
-    Parameters
-    ----------
-    t : float or array, shape (M,)
-        Seconds.
-    heading, pitch, roll : float or array, shape (M,)
-        Radians; heading clockwise from true north, pitch bow up, roll starboard down.
-    sigma : float or array, shape (M,), default 0.0035 (0.2 degrees)
-        Standard deviation, radians, of an error that lasts (a heading reference's error does).
-    source : Source, optional
-        File and rows the records came from.
-    """
-
-    t: Any
-    heading: Any
-    pitch: Any = 0.0
-    roll: Any = 0.0
-    sigma: Any = ATTITUDE_SIGMA
-    source: Source | None = None
-
-    LIMITS: ClassVar = {
-        "heading": (-4.0 * np.pi, 4.0 * np.pi, "rad"),
-        "pitch": (-np.pi, np.pi, "rad"),
-        "roll": (-np.pi, np.pi, "rad"),
-        "sigma": (1e-6, np.pi, "rad"),
-    }
-
-
-@dataclass(frozen=True, eq=False)
-class Depth(Records):
-    """Depth below the origin's level, from pressure.
-
-    Parameters
-    ----------
-    t : float or array, shape (M,)
-        Seconds.
-    depth : float or array, shape (M,)
-        Metres, positive down; up = -depth.
-    sigma : float or array, shape (M,), default 0.1
-        Standard deviation, m.
-    source : Source, optional
-        File and rows the records came from.
-    """
-
-    t: Any
-    depth: Any
-    sigma: Any = DEPTH_SIGMA
-    source: Source | None = None
-
-    LIMITS: ClassVar = {
-        "depth": (-1000.0, 12000.0, "m"),
-        "sigma": (1e-6, 1000.0, "m"),
-    }
-
-
-@dataclass(frozen=True, eq=False)
-class PositionFix(Records):
-    """A position from elsewhere: GNSS at the surface, a USBL fix, a survey mark.
-
-    Parameters
-    ----------
-    t : float or array, shape (M,)
-        Seconds.
-    east, north : float or array, shape (M,)
-        Metres.
-    up : float or array, shape (M,), optional
-        Metres; left out for a horizontal fix.
-    sigma : float or array, shape (M,), default 2.0
-        Standard deviation of each component, m. Ignored where `covariance` is given.
-    covariance : array, shape (2, 2), (3, 3), (M, 2, 2) or (M, 3, 3), optional
-        Covariance over east, north (and up), m^2.
+    beacon : str or array of str, shape (M,)
+        Name of the beacon.
+    distance : float or array, shape (M,)
+        Metres, more than zero.
+    sigma : float or array, shape (M,), default 1.0
+        Standard deviation of `distance`, m.
     source : Source, optional
         File and rows the records came from.
 
     Raises
     ------
     DataError
-        Where a value is not finite, or a covariance is not symmetric and positive definite or
-        not of the size that the components ask for.
+        Where a value is not finite, or a distance is not positive or over 100 km.
     """
 
     t: Any
-    east: Any
-    north: Any
-    up: Any = None
-    sigma: Any = POSITION_SIGMA
-    covariance: Any = None
+    beacon: Any
+    distance: Any
+    sigma: Any = SLANT_RANGE_SIGMA
     source: Source | None = None
 
     LIMITS: ClassVar = {
-        "east": (-MAX_DISTANCE, MAX_DISTANCE, "m"),
-        "north": (-MAX_DISTANCE, MAX_DISTANCE, "m"),
-        "up": (-MAX_DISTANCE, MAX_DISTANCE, "m"),
-        "sigma": (1e-6, 1e6, "m"),
+        "distance": (0.0, MAX_RANGE, "m"),
+        "sigma": (1e-6, 1e4, "m"),
     }
 
-    def __post_init__(self) -> None:
-        if self.covariance is not None:
-            matrices = np.asarray(self.covariance, dtype=np.float64)
-            object.__setattr__(
-                self, "covariance", matrices[None] if matrices.ndim == 2 else matrices
-            )
-        super().__post_init__()
-
     def _check(self) -> None:
-        if self.covariance is None:
-            return
-        d = 2 if self.up is None else 3
-        if self.covariance.shape[1:] != (d, d):
-            raise self.error(
-                0,
-                "covariance",
-                f"shape {self.covariance.shape[1:]} for a fix of {d} components",
-                f"give {d} x {d}",
-            )
-        asymmetric = np.abs(self.covariance - np.swapaxes(self.covariance, 1, 2)) > 1e-9 * np.abs(
-            self.covariance
-        ).max(axis=(1, 2), keepdims=True)
-        wrong = asymmetric.any(axis=(1, 2)) | (np.linalg.eigvalsh(self.covariance)[:, 0] <= 0.0)
-        if wrong.any():
-            raise self.error(
-                int(np.argmax(wrong)),
-                "covariance",
-                "the covariance is not symmetric and positive definite",
-                "give variances in m^2 on the diagonal",
-            )
-
-    @property
-    def dimension(self) -> Literal[2, 3]:
-        """2 for horizontal fixes, 3 where `up` is given."""
-        return 2 if self.up is None else 3
-
-    @property
-    def position(self) -> FloatArray:
-        """East, north (and up), m, shape (M, 2) or (M, 3)."""
-        parts = [self.east, self.north] + ([] if self.up is None else [self.up])
-        return np.stack(parts, axis=1)
-
-    @property
-    def covariances(self) -> FloatArray:
-        """Covariance of each fix, m^2, shape (M, 2, 2) or (M, 3, 3)."""
-        if self.covariance is not None:
-            return self.covariance
-        return np.eye(self.dimension) * self.sigma[:, None, None] ** 2
+        self._forbid(
+            self.distance == 0.0,
+            "distance",
+            self.distance,
+            " m is no distance to a beacon",
+            "drop ranges without a reply",
+        )
