@@ -407,6 +407,12 @@ def test_marginals_against_gtsam(timer, case):
 
 
 @pytest.mark.bench
+def test_poses_with_pings_against_without():
+    limit = script.LIMITS["poses_with_vs_without_pings"][str(NODES)]
+    assert rivals.compare_poses(NODES, 3).ratio <= limit
+
+
+@pytest.mark.bench
 def test_residuals(timer, case):
     """What one evaluation of all residuals and Jacobians takes; an iteration takes it once."""
     frozen = case.problem.frozen(case.start)

@@ -278,7 +278,7 @@ def test_planar_odometry_is_what_names_no_third_dimension():
 @pytest.mark.parametrize(
     ("changes", "field", "words"),
     [
-        ({"t_to": [1.0, 1.0]}, "t_to", "1.0 s is not after t_from; check that the columns"),
+        ({"t_to": [1.0, 1.0]}, "t_to", "1.0 s is not after t_from; check the unit"),
         ({"t_to": [1.0, np.inf]}, "t_to", "inf is not a finite number"),
         ({"t_from": [0.0, -1e12]}, "t_from", "is no time in seconds"),
         ({"forward": [1.0, 2e4]}, "forward", "20000.0 m is outside -10000 to 10000 m"),

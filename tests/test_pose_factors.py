@@ -259,6 +259,16 @@ def test_a_compass_reading_between_nodes_counts_for_less(node):
     assert off[1] / off[0] == pytest.approx(ratio, rel=1e-9)
 
 
+@pytest.mark.parametrize("psd", [1e-3, 1e3])
+def test_nodes_stand_no_closer_than_the_compass_reads(psd):
+    """However loose the prior on the heading between them."""
+    t = np.arange(0.0, 61.0, 10.0)
+    segment = Segment(slant_range=few_ranges(t), heading=Heading(np.arange(0.0, 60.0, 2.0), 0.3))
+    mission = one_beacon(segment, node="pose2", angular_acceleration_psd=psd)
+    nodes = model_segment(mission.segments[0], mission.options).t
+    assert 1.0 < np.diff(nodes).max() <= 2.0
+
+
 @NODES
 def test_odometry_that_turns_too_far_clockwise_and_measures_too_short(node):
     """A turn bias of 0.01 rad/s and a scale of 2 %: the true way is longer than the one read."""

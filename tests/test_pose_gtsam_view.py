@@ -284,6 +284,7 @@ NAMES = (
 EXACT = {
     "pose3, hard turns": (5e-4, 0.05),
     "pose3, motion prior alone": (5e-6, 1e-5),
+    "pose3, dvl and attitude": (5e-6, 1e-5),
 }
 
 

@@ -146,9 +146,11 @@ def off(result: Result, truth: Truth, between: bool = True) -> tuple[float, floa
     )
 
 
-def assert_recovered(result: Result, truth: Truth, between: bool = True) -> None:
+def assert_recovered(
+    result: Result, truth: Truth, between: bool = True, within: float = PLACE
+) -> None:
     place, angle = off(result, truth, between)
-    assert place < PLACE
+    assert place < within
     assert angle < ANGLE
 
 
@@ -249,7 +251,8 @@ def test_gyro_and_compass_with_their_biases(node: str):
         depth=pressure(truth, np.arange(0.0, 120.0), rng(), noise=0.0),
     )
     result = solved(segment, replace(FREE, node=node, gyro_bias_sigma=5e-3, **STEERED))
-    assert_recovered(result, truth)
+    # The bias turns the way to first order.
+    assert_recovered(result, truth, within=5e-4)
     np.testing.assert_allclose(result.shared["heading_bias"].value, 0.07, atol=ANGLE)
     np.testing.assert_allclose(result.shared["gyro_bias"].value[-1], -bias[2], atol=1e-7)
 
@@ -263,7 +266,7 @@ def test_a_gyro_beside_an_attitude_reference():
         angular_rate=gyro(truth, fine, rng(), bias=bias, noise=0.0),
     )
     result = solved(segment, replace(FREE, **STEERED), ARMS)
-    assert_recovered(result, truth)
+    assert_recovered(result, truth, within=5e-4)
     np.testing.assert_allclose(result.shared["heading_bias"].value, 0.1, atol=ANGLE)
     found = result.shared["gyro_bias"].value * [1.0, -1.0, -1.0]
     np.testing.assert_allclose(found, bias, atol=1e-6)

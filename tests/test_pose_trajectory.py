@@ -217,9 +217,8 @@ def test_extra_nodes_say_the_same(node):
     gaps = np.diff(nodes)
     wide = np.flatnonzero(gaps > 1.0)
     times = nodes[wide] + gaps[wide] * rng.uniform(0.3, 0.7, len(wide))
-    # Attitude is looked at where nodes stand, so that of the extra ones must be left out.
-    far = replace(model, t=np.union1d(nodes, times))
-    finer = solved_with(mission, far, truth, only=nodes)
+    # No attitude is read there: each record counts at the node nearest to it.
+    finer = solved_with(mission, replace(model, t=np.union1d(nodes, times)), truth)
     at, there = plain.at(times), np.searchsorted(finer.t, times)
     np.testing.assert_allclose(at.position, finer.position[there], atol=1e-5)
     np.testing.assert_allclose(at.rotation, finer.rotation[there], atol=1e-6)
@@ -233,13 +232,9 @@ def test_extra_nodes_say_the_same(node):
     assert gap_of(at.velocity_covariance[kept], speeds[kept]) < 5e-3
 
 
-def solved_with(mission, model, truth, only=None) -> PoseTrajectory:
+def solved_with(mission, model, truth) -> PoseTrajectory:
     """The trajectory with the nodes that the model has, begun at the truth."""
     problem = build_problem(mission, [model])
-    if only is not None:
-        kept = np.isin(model.t, only)
-        blocks = tuple(b if b.name != "attitude" else Rows(b, kept) for b in problem.blocks)
-        problem = replace(problem, blocks=blocks)
     layout, x = problem.layout, np.zeros(problem.layout.size)
     t, planar = layout.chains[0].t, layout.node == "pose2"
     rotation = truth.rotation(t)
@@ -254,27 +249,6 @@ def solved_with(mission, model, truth, only=None) -> PoseTrajectory:
     assert solution.converged, solution.trouble
     marginals = Marginals(problem, solution)
     return pose_trajectory(problem, solution.x, marginals, layout.chains[0], mission.options)
-
-
-class Rows:
-    """Some rows of a block."""
-
-    linear, robust = False, False
-
-    def __init__(self, block, kept: np.ndarray) -> None:
-        self.name, self._block, self._kept = block.name, block, kept
-        self.columns = block.columns[kept]
-
-    def frozen(self, x):  # noqa: ARG002 - the protocol's form
-        return None
-
-    def log_det(self) -> float:
-        return 0.0
-
-    def evaluate(self, x, frozen=None, rows=slice(None), jacobian=True):
-        residual, slopes = self._block.evaluate(x, frozen, slice(None), jacobian)
-        kept = self._kept
-        return residual[kept][rows], None if slopes is None else slopes[kept][rows]
 
 
 # -- what nodes without velocities say --

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from ubl_graph.arrays import FloatArray
+from ubl_graph.arrays import BoolArray, FloatArray
 from ubl_graph.frames import LeverArm, world_R_body
 from ubl_graph.measurements import Attitude
 
@@ -48,6 +48,18 @@ class AttitudeTrack:
         if self._slerp is None:
             return np.broadcast_to(self._rotations.as_matrix()[0], (len(times), 3, 3))
         return self._slerp(np.clip(times, self.t[0], self.t[-1])).as_matrix()
+
+    def covers(self, t0: FloatArray, t1: FloatArray, longest: float) -> BoolArray:
+        """Whether records reach over the intervals from `t0` to `t1` (M,), s.
+
+        That is, without a gap of more than `longest` (s): what a vehicle does in a longer one, and
+        beyond the ends, nobody measured.
+        """
+        inside = (t0 >= self.t[0] - 1e-6) & (t1 <= self.t[-1] + 1e-6) & self.is_known
+        gaps = np.diff(self.t)
+        closed = np.concatenate([[0.0], np.cumsum(np.where(gaps > longest, gaps, 0.0))])
+        missing = np.interp(t1, self.t, closed) - np.interp(t0, self.t, closed)
+        return inside & (missing < 1e-6)
 
     def lever(self, arm: LeverArm, times: FloatArray) -> FloatArray:
         """Lever arm in world axes at times (M,), shape (M, 3), metres."""

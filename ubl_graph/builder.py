@@ -59,6 +59,8 @@ class SegmentModel:
         DVL velocities by reference.
     gyro : GyroTrack, optional
         Integrated rates, for pose nodes.
+    gyro_bottom, gyro_water : Preintegration, optional
+        The same velocities, turned by the gyro alone.
     turn_sigma : float
         White noise of the attitude by which velocities are turned, rad, where the nodes' attitude
         does not have it in common.
@@ -74,6 +76,8 @@ class SegmentModel:
     bottom: Preintegration | None
     water: Preintegration | None
     gyro: GyroTrack | None = None
+    gyro_bottom: Preintegration | None = None
+    gyro_water: Preintegration | None = None
     turn_sigma: float = 0.0
     heads: bool = True
     still: bool = False

@@ -18,11 +18,12 @@ from ubl_graph.builder import SegmentModel
 from ubl_graph.errors import SolverError
 from ubl_graph.factors import linear
 from ubl_graph.graph import build_problem, model_segment
-from ubl_graph.initial import START_LIMIT, find_starts
+from ubl_graph.initial import START_LIMIT
 from ubl_graph.measurements import OneWayRange, TwoWayRange
 from ubl_graph.mission import Mission, Segment
 from ubl_graph.nodes import LEAST_MOVE, NOMINAL_SPEED, node_times, order_of
 from ubl_graph.options import AUTO, Motion, Options
+from ubl_graph.pose_initial import find_tracks
 from ubl_graph.problem import Problem
 from ubl_graph.solve.banded import BandedEngine
 from ubl_graph.solve.evidence import log_evidence
@@ -293,6 +294,8 @@ class NoiseSearch:
         segment = replace(segment, start=model.segment.start)
         if self._odometry or options.node_spacing is not None:
             return replace(model, segment=segment)
+        if options.node != "point":
+            return replace(model, segment=segment, t=model_segment(segment, options).t)
         return replace(model, segment=segment, t=node_times(segment, options))
 
     def _evaluate(
@@ -340,10 +343,10 @@ def _modelled(mission: Mission) -> tuple[list[SegmentModel], list[list[Track]]]:
     tracks: list[tuple[Track, ...]] = []
     for segment in mission.segments:
         model = model_segment(segment, mission.options)
-        starts = find_starts(mission, model)
+        starts = find_tracks(mission, model)
         if starts.start_sigmas is not None and starts.start_sigmas >= START_LIMIT:
             model = replace(model, segment=replace(segment, start=None))
-            starts = find_starts(mission, model)
+            starts = find_tracks(mission, model)
         models.append(model)
         tracks.append(starts.tracks)
     if len(models) == 1:

@@ -14,6 +14,8 @@ PLANAR = np.array([0, 1, 5])
 
 #: Planar odometry says of up, roll and pitch, with so many times its noise, that they stay.
 OUT_OF_PLANE = 30.0
+#: Growing noise is never less than this, m and rad: a vehicle that stands has some, too.
+LEAST_WAY, LEAST_TURN = 1e-4, 1e-6
 
 
 def odometry_covariances(records: Odometry, options: Options) -> FloatArray:
@@ -36,6 +38,7 @@ def odometry_covariances(records: Odometry, options: Options) -> FloatArray:
         for angle in (options.odometry_way_turn_noise_deg, options.odometry_time_turn_noise_deg)
     )
     about = by_way**2 * way + by_time**2 * dt
+    along, about = np.maximum(along, LEAST_WAY**2), np.maximum(about, LEAST_TURN**2)
     planar = records.dimension == 2
     diagonal = [along, along, about] if planar else [along] * 3 + [about] * 3
     growing = np.stack(diagonal, axis=1)[:, :, None] * np.eye(len(diagonal))

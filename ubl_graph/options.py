@@ -180,7 +180,7 @@ class Options:
     solver: Solver = "auto"
     """GTSAM on the factor graph, or the banded normal equations; both take the same steps to the
     same answer, the banded solver some 30 times faster. Auto solves on the fast path and has GTSAM
-    confirm the answer up to 5 000 nodes (4 000 rows where nodes are poses); more than 64 shared
+    confirm the answer up to 5 000 nodes (8 000 rows where nodes are poses); more than 64 shared
     unknowns GTSAM solves alone."""
 
     node_spacing: float | None = None
@@ -236,17 +236,7 @@ class Options:
     ) -> None:
         if (value is None and optional) or (value == AUTO and auto):
             return
-        may_vanish = name.startswith(
-            (
-                "dvl_",
-                "sound_speed_",
-                "current_walk",
-                "clock_",
-                "heading_bias_",
-                "gyro_",
-                "odometry_",
-            )
-        )
+        may_vanish = name.startswith(MAY_VANISH)
         if (
             isinstance(value, bool)
             or not isinstance(value, (int, float))

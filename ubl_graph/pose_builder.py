@@ -30,7 +30,7 @@ from ubl_graph.factors.tips import PoseAntenna, PosesAt, TipBlock, Tips
 from ubl_graph.frames import LeverArm
 from ubl_graph.layout import Chain, Layout
 from ubl_graph.measurements import Odometry, PositionFix
-from ubl_graph.mission import Setup, Start
+from ubl_graph.mission import Segment, Setup, Start
 from ubl_graph.odometry_noise import (
     PLANAR,
     in_space,
@@ -40,7 +40,7 @@ from ubl_graph.odometry_noise import (
     whitening_of,
 )
 from ubl_graph.pose_states import GYRO_STATES, ODOMETRY_STATES, odometry_sigmas
-from ubl_graph.trajectory import inside, whitening
+from ubl_graph.trajectory import inside, longest_interval, whitening
 
 #: What is known of a rotation (rad) and of a turning rate (rad/s) before any measurement.
 FREE_ROTATION, FREE_RATE = 30.0, 10.0
@@ -48,6 +48,8 @@ FREE_ROTATION, FREE_RATE = 30.0, 10.0
 SIDEWAYS = 0.5
 #: Lean (sine of roll or pitch) of a vehicle that has no attitude reference.
 LEANING = 0.3
+#: Between attitude records the vehicle may have turned otherwise by so much, rad, and no more.
+TURN_ERROR = 0.01
 #: Attitude records farther from a node than this many median intervals say nothing of it,
 ATTITUDE_GAPS = 5.0
 #: but ones within this do, s.
@@ -70,15 +72,22 @@ class PoseBuilder(Builder):
         blocks = super().segment_blocks(chain, model)
         if _moves_unseen(model):
             blocks.append(self._forward(chain))
-        leaning = model.segment.attitude is None and not (self.planar or self.layout.still)
-        return [*blocks, self._upright(chain)] if leaning else blocks
+        leaning = self._leans(model.segment)
+        return [*blocks, self.upright(chain)] if leaning else blocks
 
-    def _upright(self, chain: Chain) -> Block:
+    def _leans(self, segment: Segment) -> bool:
+        """Whether nothing tells roll and pitch of a vehicle in space."""
+        known = segment.attitude is not None and len(segment.attitude) > 0
+        steps = segment.odometry
+        spatial = steps is not None and len(steps) > 0 and steps.dimension == 3
+        return not (self.planar or known or (self.layout.still and spatial))
+
+    def upright(self, chain: Chain) -> Block:
         """Vehicles swim upright: what holds roll and pitch that no reference tells."""
         k = chain.first + np.arange(len(chain.t))
-        white = np.broadcast_to(np.eye(2) / LEANING, (len(k), 2, 2))
+        white = np.broadcast_to(np.eye(3) / LEANING, (len(k), 3, 3))
         ends = (self._nodes(k),)
-        return PoseBlock("upright", ends, pose_motion.upright(), white, np.arange(2))
+        return PoseBlock("upright", ends, pose_motion.upright(), white, np.arange(3))
 
     def _forward(self, chain: Chain) -> Block:
         """The bow is where the vehicle goes: what holds a heading that nothing tells."""
@@ -211,7 +220,7 @@ class PoseBuilder(Builder):
         if model.gyro is not None:
             blocks += self._gyro_blocks(chain, model)
         if segment.attitude is not None and len(segment.attitude):
-            blocks.append(self._attitude_block(chain, model.attitude))
+            blocks.append(self._attitude_block(chain, AttitudeTrack(segment.attitude)))
         if segment.heading is not None:
             rows = segment.heading[inside(chain.t, segment.heading.t)]
             if len(rows):
@@ -255,42 +264,75 @@ class PoseBuilder(Builder):
     def _way_blocks(
         self, chain: Chain, model: SegmentModel, samples: Preintegration, *, current: bool
     ) -> tuple[list[Block], BoolArray]:
-        """Displacements and velocities of the DVL, and which intervals they cover."""
-        arm = self.setup.vehicle.dvl.body
-        keep = np.arange(2 if self.planar else 3)
-        label = "water " if current else ""
+        """Displacements and velocities of the DVL, and which intervals they cover.
+
+        Gyros say how the vehicle turned within an interval where they cover it, else the attitude
+        records do, where there is no gap in them that a vehicle could turn in.
+        """
+        t0, t1 = chain.t[:-1], chain.t[1:]
+        longest = longest_interval(2, self.options.angular_acceleration_psd, TURN_ERROR)
+        turned = model.gyro_water if current else model.gyro_bottom
+        by_gyro = np.zeros(len(t0), dtype=np.bool_)
         blocks: list[Block] = []
-        moved = samples.between(chain.t[:-1], chain.t[1:])
-        covered = moved.covered & model.attitude.is_known
-        rows = np.flatnonzero(covered)
-        if len(rows):
-            k, dt = chain.first + rows, np.diff(chain.t)[rows]
-            back = np.swapaxes(self._read(model.attitude, chain.t[rows]), 1, 2)
-            body = self._body_way(moved, rows, back, dt, arm, 2 if current else 0)
-            turning = self._turned_by_gyro(model)
-            if turning:
-                # Half of what the bias turns within the interval is there on the way.
-                carried = 0.5 * dt[:, None, None] * lie.cross_matrix(body.way)
-                body = body.with_error(carried[:, :, 2:] if self.planar else carried)
-            extra, units = self._dvl_columns((k, k + 1) if current else (), len(rows), turning)
-            ends = (self._nodes(k), self._nodes(k + 1))
-            aside = model.turn_sigma * np.linalg.norm(body.way, axis=1)
-            white = np.eye(len(keep)) / np.hypot(moved.sigma[rows], aside)[:, None, None]
-            residual = pose_motion.displacement(body)
-            name = f"{label}odometry"
-            blocks.append(PoseBlock(name, ends, residual, white, keep, extra, units))
+        if turned is not None and model.gyro is not None:
+            track = AttitudeTrack.of(model.gyro.t, model.gyro.rotations)
+            by_gyro = turned.between(t0, t1).covered & model.gyro.between(t0, t1).covered
+            blocks += self._displacement(chain, turned, track, by_gyro, 0.0, current, gyro=True)
+        told = samples.between(t0, t1).covered & model.attitude.covers(t0, t1, longest) & ~by_gyro
+        alone = self._turned_by_gyro(model)
+        sigma = model.turn_sigma
+        blocks += self._displacement(
+            chain, samples, model.attitude, told, sigma, current, gyro=alone
+        )
+        keep = np.arange(2 if self.planar else 3)
         rates = samples.rates_at(chain.t)
         rows = np.flatnonzero(rates.covered)
         if len(rows):
             k = chain.first + rows
             back = np.swapaxes(self._read(model.attitude, chain.t[rows]), 1, 2)
+            arm = self.setup.vehicle.dvl.body
             body = self._body_way(rates, rows, back, np.ones(len(rows)), arm, 1 if current else 0)
             extra, units = self._dvl_columns((k,) if current else (), len(rows))
             white = np.eye(len(keep)) / rates.sigma[rows, None, None]
-            residual = pose_motion.velocity(body)
             ends = (self._nodes(k, moving=True),)
-            blocks.append(PoseBlock(f"{label}velocity", ends, residual, white, keep, extra, units))
-        return blocks, covered
+            name = "water velocity" if current else "velocity"
+            residual = pose_motion.velocity(body)
+            blocks.append(PoseBlock(name, ends, residual, white, keep, extra, units))
+        return blocks, by_gyro | told
+
+    def _displacement(
+        self,
+        chain: Chain,
+        samples: Preintegration,
+        track: AttitudeTrack,
+        which: BoolArray,
+        turn_sigma: float,
+        current: bool,
+        *,
+        gyro: bool,
+    ) -> list[Block]:
+        """Displacements of some intervals, turned back by a track."""
+        rows = np.flatnonzero(which)
+        if not len(rows):
+            return []
+        keep = np.arange(2 if self.planar else 3)
+        k, dt = chain.first + rows, np.diff(chain.t)[rows]
+        moved = samples.between(chain.t[:-1], chain.t[1:])
+        back = np.swapaxes(self._read(track, chain.t[rows]), 1, 2)
+        arm = self.setup.vehicle.dvl.body
+        body = self._body_way(moved, rows, back, dt, arm, 2 if current else 0)
+        biased = gyro and self.layout.has("gyro_bias")
+        if biased:
+            # Half of what the bias turns within the interval is there on the way.
+            carried = 0.5 * dt[:, None, None] * lie.cross_matrix(body.way)
+            body = body.with_error(carried[:, :, 2:] if self.planar else carried)
+        extra, units = self._dvl_columns((k, k + 1) if current else (), len(rows), biased)
+        ends = (self._nodes(k), self._nodes(k + 1))
+        aside = turn_sigma * np.linalg.norm(body.way, axis=1)
+        white = np.eye(len(keep)) / np.hypot(moved.sigma[rows], aside)[:, None, None]
+        residual = pose_motion.displacement(body)
+        name = "water odometry" if current else "odometry"
+        return [PoseBlock(name, ends, residual, white, keep, extra, units)]
 
     def _body_way(
         self,
@@ -367,7 +409,7 @@ class PoseBuilder(Builder):
         """What the attitude reference reads at the nodes."""
         gaps = np.diff(track.t)
         reach = max(
-            ATTITUDE_GAPS * float(np.median(gaps)) if len(gaps) else np.inf, LEAST_ATTITUDE_GAP
+            ATTITUDE_GAPS * float(np.median(gaps)) if len(gaps) else 0.0, LEAST_ATTITUDE_GAP
         )
         after = np.searchsorted(track.t, chain.t).clip(0, len(track.t) - 1)
         nearest = np.minimum(
@@ -377,6 +419,12 @@ class PoseBuilder(Builder):
         if len(gaps):
             # Beyond its records the track is held, and says nothing of a vehicle that turns.
             near &= inside(track.t, chain.t)
+        # No record counts for more than one node, where nodes are denser than records.
+        own = np.zeros(len(chain.t), dtype=np.bool_)
+        own[node_of(chain.t, track.t)] = True
+        near &= own
+        if not near.any():
+            near[np.argmin(nearest)] = True
         nodes = np.flatnonzero(near)
         k = chain.first + nodes
         residual = pose_motion.attitude(self._read(track, chain.t[nodes]))
@@ -419,15 +467,12 @@ class PoseBuilder(Builder):
 
     def _tips(self, poses: PosesAt, arm: LeverArm) -> Tips:
         noise = np.zeros(6)
-        if not self.layout.still:
-            moving = PLANAR if self.planar else np.arange(6)
-            noise[moving] = self.twist_psd[moving]
+        moving = PLANAR if self.planar else np.arange(6)
+        noise[moving] = self.twist_psd[moving]
         return Tips(poses, arm.body, noise)
 
     def _swing(self, poses: PosesAt) -> FloatArray:
         """Standard deviation of what the prior lets the heading do between nodes, (M,), rad."""
-        if self.layout.still:
-            return np.zeros(len(poses.variance_factor))
         return np.sqrt(self.options.angular_acceleration_psd * poses.variance_factor)
 
     def _shared(self, names: Sequence[str], m: int) -> IntArray:

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ubl_graph import lie
 from ubl_graph.arrays import FloatArray
-from ubl_graph.builder import FREE_POSITION, SegmentModel
+from ubl_graph.builder import FREE_POSITION, SegmentModel, heading_sigma
 from ubl_graph.initial import Starts, find_starts
 from ubl_graph.measurements import Odometry, OneWayRange, SlantRange
 from ubl_graph.mission import Mission
@@ -24,7 +24,7 @@ from ubl_graph.odometry_noise import PLANAR, node_of, odometry_covariances
 from ubl_graph.pings import Pings, leg_times, measured_times
 from ubl_graph.pose_nodes import ends_of
 from ubl_graph.pose_starts import PoseStart, find_pose_starts
-from ubl_graph.pose_states import COMPASS_SIGMA, odometry_sigmas
+from ubl_graph.pose_states import COMPASS_SIGMA, lasting_heading_error, odometry_sigmas
 from ubl_graph.pose_windows import Anchors, ReckonedTrack, TrackRanges, Unknowns
 from ubl_graph.track import Track
 
@@ -32,6 +32,12 @@ from ubl_graph.track import Track
 MOST_STARTS = 6
 #: An answer whose cost is higher by more than this is not solved.
 WORTH_SOLVING = 1e3
+#: A heading reference that may be off by more than this does not lead the search, rad.
+TRUSTED_HEADING = float(np.deg2rad(10.0))
+#: The search lets odometry be off by no more: a wide scale would drive it backwards.
+WIDEST_SCALE = 0.1
+#: No reading of it counts for more than this, rad.
+LEAST_HEADING = float(np.deg2rad(1.0))
 #: Compass readings that the search looks at; more are thinned out evenly.
 MOST_READINGS = 50
 #: What is not known of an anchor.
@@ -81,8 +87,9 @@ def find_pose_tracks(mission: Mission, model: SegmentModel) -> Starts:
         Where nothing says where the vehicle is.
     """
     velocities = model.bottom is not None or model.water is not None
+    trusted = model.heads and _heading_sigma(mission, model) <= TRUSTED_HEADING
     reckoned = None
-    if len(model.t) > 1 and not (model.heads and velocities):
+    if len(model.t) > 1 and not (trusted and velocities):
         reckoned = _reckoned(mission, model)
     if reckoned is None:
         found = find_starts(mission, model)
@@ -102,6 +109,17 @@ def find_pose_tracks(mission: Mission, model: SegmentModel) -> Starts:
     return Starts(tuple(tracks), None, runner_up)
 
 
+def find_tracks(mission: Mission, model: SegmentModel) -> Starts:
+    """Search a segment's start, whatever its nodes are: `find_starts` or `find_pose_tracks`."""
+    find = find_starts if mission.options.node == "point" else find_pose_tracks
+    return find(mission, model)
+
+
+def _heading_sigma(mission: Mission, model: SegmentModel) -> float:
+    """What the heading reference may lastingly be off by, rad."""
+    return heading_sigma(mission.options, lasting_heading_error([model.segment]))
+
+
 def _reckoned(mission: Mission, model: SegmentModel) -> Reckoned | None:
     """The track as odometry or gyros and velocities know it; None where neither does."""
     options, segment = mission.options, model.segment
@@ -113,7 +131,7 @@ def _reckoned(mission: Mission, model: SegmentModel) -> Reckoned | None:
         sigmas = odometry_sigmas(options)
         unknowns = Unknowns(
             turn_bias=sigmas["odometry_turn_bias"],
-            scale=sigmas["odometry_scale"],
+            scale=min(sigmas["odometry_scale"], WIDEST_SCALE),
             range_scale=range_scale,
             up=up,
         )
@@ -124,18 +142,21 @@ def _reckoned(mission: Mission, model: SegmentModel) -> Reckoned | None:
         )
         return Reckoned(rotation, position, place, heading, unknowns)
     samples = model.bottom or model.water
-    if samples is None or model.gyro is None or model.heads:
+    if samples is None or not (model.gyro is not None or model.heads):
         return None
-    moved = samples.between(np.full(len(model.t), model.t[0]), model.t)
-    turns = model.gyro.between(np.full(len(model.t), model.t[0]), model.t)
+    first = np.full(len(model.t), model.t[0])
+    moved = samples.between(first, model.t)
+    turned = np.zeros(len(model.t))
+    if model.gyro is not None and not model.heads:
+        turned = model.gyro.between(first, model.t).sigma ** 2
     unknowns = Unknowns(
-        turn_bias=options.gyro_bias_sigma,
-        scale=options.dvl_scale_sigma,
+        turn_bias=0.0 if model.heads else options.gyro_bias_sigma,
+        scale=min(options.dvl_scale_sigma, WIDEST_SCALE),
         range_scale=range_scale,
         up=up,
     )
     rotation = model.attitude.at(model.t)
-    return Reckoned(rotation, moved.displacement, moved.sigma**2, turns.sigma**2, unknowns)
+    return Reckoned(rotation, moved.displacement, moved.sigma**2, turned, unknowns)
 
 
 def compose(t: FloatArray, records: Odometry) -> tuple[FloatArray, FloatArray]:
@@ -253,6 +274,12 @@ def _anchors(mission: Mission, model: SegmentModel) -> Anchors:
         for t, heading, sigma in zip(compass.t, compass.heading, compass.sigma, strict=True):
             yaw_sigma = float(np.hypot(sigma, lasting))
             rows.append((t, [0.0] * 3, [UNKNOWN] * 3, 0.5 * np.pi - heading, yaw_sigma))
+    attitude = segment.attitude
+    if attitude is not None and len(attitude):
+        many = np.unique(np.linspace(0, len(attitude) - 1, MOST_READINGS // 5).astype(int))
+        for t, heading in zip(attitude.t[many], attitude.heading[many], strict=True):
+            sigma = max(_heading_sigma(mission, model), LEAST_HEADING)
+            rows.append((t, [0.0] * 3, [UNKNOWN] * 3, 0.5 * np.pi - heading, sigma))
     rows = [row for row in rows if model.t[0] <= row[0] <= model.t[-1]]
     if not rows:
         return Anchors.none()

@@ -71,10 +71,14 @@ def lasting_heading_error(segments: Sequence[Segment]) -> float:
 
 
 def held_up(setup: Setup, segment: Segment, t: FloatArray) -> FloatArray:
-    """Up at which a planar vehicle's reference point stays, (N,), m: as its depth sensor says."""
+    """Up at which a planar vehicle stays, (N,), m: as its depths, fixes or start say."""
     if segment.depth is not None and len(segment.depth):
         depth = segment.depth[np.argsort(segment.depth.t)]
         return -np.interp(t, depth.t, depth.depth) - setup.vehicle.depth_sensor.body[2]
+    fixes = segment.position
+    if fixes is not None and len(fixes) and fixes.up is not None:
+        fixes = fixes[np.argsort(fixes.t)]
+        return np.interp(t, fixes.t, fixes.up) - setup.vehicle.antenna.body[2]
     if segment.start is not None and segment.start.up is not None:
         return np.full(len(t), segment.start.up)
     return np.zeros(len(t))

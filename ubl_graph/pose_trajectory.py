@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from ubl_graph.trajectory import (
     NodeCovariance,
     States,
     Trajectory,
+    bridge_variance,
     interpolation_variance,
     locate,
 )
@@ -177,12 +179,15 @@ class PoseTrajectory(Trajectory):
 
     def _own(self, dt: FloatArray, s: FloatArray, derivative: int) -> FloatArray:
         """The prior's variance between known nodes, along and about the axes, (M, 6)."""
-        horizontal, vertical = (0.0, 0.0) if self.still else self.psd
-        turning = 0.0 if self.still else self.turning_psd
+        (horizontal, vertical), turning = self.psd, self.turning_psd
         density = np.array([horizontal, horizontal, vertical, turning, turning, turning])
         if self.planar:
             density[2:5] = 0.0
-        own = interpolation_variance(2, dt, s, 1 if derivative else 0)
+        order: Literal[0, 1] = 1 if derivative else 0
+        if self.still:
+            own = bridge_variance(dt, s, order)
+        else:
+            own = interpolation_variance(2, dt, s, order)
         return own[:, None] * density
 
 

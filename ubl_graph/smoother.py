@@ -18,10 +18,10 @@ from ubl_graph.assembly import assemble_segment, beacons_of, direction, shared_o
 from ubl_graph.builder import SegmentModel
 from ubl_graph.errors import SolverError
 from ubl_graph.graph import build_problem, model_segment, shares_unknowns
-from ubl_graph.initial import START_LIMIT, Starts, find_starts
+from ubl_graph.initial import START_LIMIT, Starts
 from ubl_graph.layout import Chain
 from ubl_graph.mission import Mission
-from ubl_graph.pose_initial import find_pose_tracks
+from ubl_graph.pose_initial import find_tracks
 from ubl_graph.problem import Problem
 from ubl_graph.result import DOWN_WEIGHTED, Result, SegmentResult, Shared
 from ubl_graph.solve.choice import Choice, choose
@@ -215,8 +215,7 @@ def _solved(
 
 def _search(work: _Work, model: SegmentModel) -> tuple[SegmentModel, Starts]:
     """Find a segment's start; a start prior that all pings contradict is left out, and said."""
-    find = find_starts if work.mission.options.node == "point" else find_pose_tracks
-    starts = find(work.mission, model)
+    starts = find_tracks(work.mission, model)
     if starts.start_sigmas is None or starts.start_sigmas < START_LIMIT:
         return model, starts
     work.warn(
@@ -225,7 +224,7 @@ def _search(work: _Work, model: SegmentModel) -> tuple[SegmentModel, Starts]:
         "vehicle; it was left out",
     )
     model = replace(model, segment=replace(model.segment, start=None))
-    return model, find(work.mission, model)
+    return model, find_tracks(work.mission, model)
 
 
 def _solve_from(

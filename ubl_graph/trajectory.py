@@ -138,6 +138,16 @@ def interpolation_variance(
     return dt**3 * (u**3 / 3.0 - 1.25 * u**4) if derivative else (dt * u) ** 5 / 20.0
 
 
+def bridge_variance(dt: ArrayLike, s: ArrayLike, derivative: Literal[0, 1] = 0) -> FloatArray:
+    """Variance between two known places whose velocities are free, at unit density, shape (M,).
+
+    That of WNOA about the straight way: with u = s (1 - s), of the position dt^3 u^2 / 3, 4 times
+    as much in the middle as where velocities are known, and of the velocity dt (1/3 - u).
+    """
+    dt, u = np.asarray(dt, dtype=np.float64), np.asarray(s) * (1.0 - np.asarray(s))
+    return dt * (1.0 / 3.0 - u) if derivative else dt**3 * u**2 / 3.0
+
+
 def interpolation_covariance(order: Order, dt: float, s: float) -> FloatArray:
     """Covariance of the whole state between two known nodes at unit density, (order, order).
 

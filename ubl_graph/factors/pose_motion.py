@@ -231,7 +231,7 @@ def attitude(measured: FloatArray) -> PoseResidual:
 
 
 def upright() -> PoseResidual:
-    """Lean of a pose, 2 components: the up of the world along the body's forward and left axes."""
+    """Lean of a pose, 3 components: the world's up in the body's axes, less the body's own."""
 
     def residual(
         poses: Sequence[Poses],
@@ -240,9 +240,9 @@ def upright() -> PoseResidual:
     ) -> tuple[FloatArray, list[FloatArray], FloatArray]:
         (pose,) = poses
         up = pose.rotation[:, 2]
-        slope = np.zeros((len(up), 2, 12))
-        slope[:, :, TURNED] = lie.cross_matrix(up)[:, :2]
-        return up[:, :2], [slope], np.zeros((len(up), 2, extra.shape[1]))
+        slope = np.zeros((len(up), 3, 12))
+        slope[:, :, TURNED] = lie.cross_matrix(up)
+        return up - UP, [slope], np.zeros((len(up), 3, extra.shape[1]))
 
     return residual
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from ubl_graph.factors.block import ALL_ROWS
 from ubl_graph.factors.poses import PoseNodes
 from ubl_graph.layout import Chain, Layout
 from ubl_graph.pose_path import Poses, between, path_weights, still_weights
-from ubl_graph.trajectory import interpolation_variance, locate
+from ubl_graph.trajectory import bridge_variance, interpolation_variance, locate
 
 
 class PosesAt:
@@ -34,8 +35,7 @@ class PosesAt:
     columns : array of int, shape (M, C)
         Columns that each pose is made of.
     variance_factor : array, shape (M,)
-        Interpolation variance at unit density, s^3; of nodes without velocities the share of the
-        interval's own variance that is left in between.
+        Variance between the nodes at unit density, s^3.
     """
 
     def __init__(self, layout: Layout, chain: Chain, times: FloatArray) -> None:
@@ -49,7 +49,8 @@ class PosesAt:
         else:
             self._ends = (PoseNodes(layout, first), PoseNodes(layout, first + 1))
         self.columns = np.concatenate([end.columns for end in self._ends], axis=1)
-        self.variance_factor = s * (1.0 - s) if layout.still else interpolation_variance(2, dt, s)
+        within = bridge_variance if layout.still else partial(interpolation_variance, 2)
+        self.variance_factor = within(dt, s)
         if layout.still:
             self._weights = still_weights(s)
         else:
@@ -114,8 +115,7 @@ class Tips:
     arm : array, shape (3,)
         Reference point to the point, body axes, m.
     psd : array, shape (6,)
-        Noise density of the motion prior along and about the body's axes; of nodes without
-        velocities the variance (along, about) of the whole interval.
+        Noise density of the motion along and about the body's axes.
     """
 
     def __init__(self, poses: PosesAt, arm: FloatArray, psd: FloatArray) -> None:

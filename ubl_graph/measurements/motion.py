@@ -21,6 +21,9 @@ ANGULAR_RATE_SIGMA = 1e-3  #: rad/s; a MEMS gyro's sample at 100 Hz
 _FLU = np.array([1.0, -1.0, -1.0])
 _FLU.setflags(write=False)
 
+#: Odometry steps shorter than this take no time, s.
+SHORTEST_STEP = 2e-6
+
 
 @dataclass(frozen=True, eq=False)
 class Velocity(Records):
@@ -238,11 +241,11 @@ class Odometry(Records):
 
     def _check(self) -> None:
         self._forbid(
-            self.t_to <= self.t_from,
+            self.t_to - self.t_from < SHORTEST_STEP,
             "t_to",
             self.t_to,
             " s is not after t_from",
-            "check that the columns are not swapped, and drop steps that take no time",
+            "check the unit, and that the columns are not swapped; drop steps that take no time",
         )
         if self.covariance is None:
             return

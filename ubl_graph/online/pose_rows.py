@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ubl_graph import lie
-from ubl_graph.arrays import FloatArray
+from ubl_graph.arrays import BoolArray, FloatArray
 from ubl_graph.attitude import AttitudeTrack
 from ubl_graph.builder import Builder, SegmentModel
 from ubl_graph.factors import pose_motion
@@ -28,7 +28,9 @@ from ubl_graph.odometry_noise import PLANAR, node_of, odometry_covariances, whit
 from ubl_graph.online.buffer import Buffer, Entry, columns_of, fixes_of, odometry_of
 from ubl_graph.online.frame import Break, Frame
 from ubl_graph.online.grid_odometry import on_grid
+from ubl_graph.pose_builder import PoseBuilder
 from ubl_graph.pose_path import Poses
+from ubl_graph.trajectory import inside
 
 #: Rows are made anew where nodes have moved or turned by more than this from where they were made:
 #: the second order is then a thousandth of a millimetre a second.
@@ -70,8 +72,10 @@ def tolerances(frame: Frame) -> FloatArray:
     return np.concatenate([node, node, *shared])
 
 
-def pose_blocks(frame: Frame, buffer: Buffer, builder: Builder, chain: Chain) -> list[Block]:
-    """All blocks of the intervals of a chain of poses, but for ranges.
+def pose_blocks(
+    frame: Frame, buffer: Buffer, builder: PoseBuilder, chain: Chain, x: FloatArray
+) -> list[LinearBlock]:
+    """All blocks of the intervals of a chain of poses, but for ranges, linearised.
 
     Parameters
     ----------
@@ -83,18 +87,20 @@ def pose_blocks(frame: Frame, buffer: Buffer, builder: Builder, chain: Chain) ->
         Over a layout of this chain alone.
     chain : Chain
         Nodes of the grid.
+    x : array
+        Where they stand.
     """
     begin, end = float(chain.t[0]), float(chain.t[-1])
     # A record of the very end belongs to the next interval, as one of the very beginning to this.
-    inside = {
+    own = {
         kind: [e for e in buffer.between(kind, begin - 1e-9, end - 1e-9) if not e.gated]
         for kind in ("depth", "heading", "position", "set_position")
     }
-    model = _model(frame, buffer, chain, inside)
+    model = _model(frame, buffer, chain, own)
     blocks: list[Block] = [
-        builder.fix_block(chain, rows, model.attitude) for rows in fixes_of(inside["position"])
+        builder.fix_block(chain, rows, model.attitude) for rows in fixes_of(own["position"])
     ]
-    for entry in inside["set_position"]:
+    for entry in own["set_position"]:
         blocks += builder.start_blocks(chain, entry.record)  # pyright: ignore[reportArgumentType]
     newest = _newest_attitude(frame, buffer, builder, chain)
     if newest is not None:
@@ -102,7 +108,32 @@ def pose_blocks(frame: Frame, buffer: Buffer, builder: Builder, chain: Chain) ->
     odometry = model.segment.odometry
     if odometry is not None:
         blocks.append(_arrival(builder, chain, odometry))
-    return blocks + builder.linear_blocks(chain, model, CONSTANT_SPAN)
+    if not frame.is_planar and not buffer.of("attitude"):
+        blocks.append(builder.upright(chain))
+    blocks += builder.linear_blocks(chain, model, CONSTANT_SPAN)
+    linear = [linearised(block, x) for block in blocks if len(block.columns)]
+    told = _told_nodes(frame, model, chain)
+    return [
+        _of_nodes(block, frame, told) if block.name == "attitude" else block for block in linear
+    ]
+
+
+def _told_nodes(frame: Frame, model: SegmentModel, chain: Chain) -> BoolArray:
+    """Nodes that attitude records enclose, and that are the nearest ones to some of them, (N,).
+
+    Of a few intervals alone the builder cannot tell: no record counts at more than one node.
+    """
+    records = model.segment.attitude
+    if records is None:
+        return np.zeros(len(chain.t), dtype=np.bool_)
+    near = np.abs(records.t[None] - chain.t[:, None]).min(axis=1) <= 0.5 * frame.spacing + 1e-9
+    return near & inside(records.t[[0, -1]], chain.t)
+
+
+def _of_nodes(block: LinearBlock, frame: Frame, which: BoolArray) -> LinearBlock:
+    """The rows of some nodes."""
+    stay = which[block.columns[:, 0] // frame.width]
+    return LinearBlock(block.name, block.columns[stay], block.matrix[stay], block.target[stay])
 
 
 def _newest_attitude(frame: Frame, buffer: Buffer, builder: Builder, chain: Chain) -> Block | None:
@@ -233,9 +264,7 @@ def _arrival(builder: Builder, chain: Chain, odometry: Odometry) -> Block:
     return PoseBlock("arrival", ends, residual, whitening_of(whole), keep)
 
 
-def _model(
-    frame: Frame, buffer: Buffer, chain: Chain, inside: dict[str, list[Entry]]
-) -> SegmentModel:
+def _model(frame: Frame, buffer: Buffer, chain: Chain, own: dict[str, list[Entry]]) -> SegmentModel:
     """The records of some intervals as a segment, with what is derived from them."""
     begin, end = float(chain.t[0]), float(chain.t[-1])
     velocity = _around(buffer, "velocity", begin, end, frame.gap)
@@ -247,39 +276,56 @@ def _model(
     if len(rates) > 1:
         longest = usual_gap(buffer, "angular_rate")
         gyro = GyroTrack(columns_of("angular_rate", rates), longest)
-    track = _turns(buffer, attitudes, gyro, first, last)
-    by_reference: dict[str, Preintegration | None] = {"bottom": None, "water": None}
-    for reference in by_reference:
-        rows = [e for e in velocity if e.values[-1] == reference]
-        if len(rows) > 1:
-            psd = frame.setup.options.number("acceleration_psd")
-            records = columns_of("velocity", rows)
-            by_reference[reference] = Preintegration(records, track, psd, frame.gap)
+    track, turn_sigma = _turns(buffer, attitudes, gyro, first, last)
+    by_gyro = None if gyro is None else AttitudeTrack.of(gyro.t, gyro.rotations)
     odometry = [e for e in buffer.reaching("odometry", begin) if e.begin < end and not e.gated]
     segment = Segment(
-        depth=columns_of("depth", inside["depth"]) if inside["depth"] else None,
-        heading=columns_of("heading", inside["heading"]) if inside["heading"] else None,
+        depth=columns_of("depth", own["depth"]) if own["depth"] else None,
+        heading=columns_of("heading", own["heading"]) if own["heading"] else None,
         # A single record says nothing of the nodes beside it.
         attitude=columns_of("attitude", attitudes) if len(attitudes) > 1 else None,
         odometry=on_grid(odometry_of(odometry), chain.t, frame.setup.options),
     )
-    bottom, water = by_reference["bottom"], by_reference["water"]
-    return SegmentModel(segment, chain.t, track, bottom, water, gyro)
+    return SegmentModel(
+        segment,
+        chain.t,
+        track,
+        _ways(frame, velocity, "bottom", track),
+        _ways(frame, velocity, "water", track),
+        gyro,
+        _ways(frame, velocity, "bottom", by_gyro),
+        _ways(frame, velocity, "water", by_gyro),
+        turn_sigma,
+    )
+
+
+def _ways(
+    frame: Frame, velocity: list[Entry], reference: str, track: AttitudeTrack | None
+) -> Preintegration | None:
+    """Velocities of a reference integrated along an attitude."""
+    rows = [e for e in velocity if e.values[-1] == reference]
+    if len(rows) < 2 or track is None:
+        return None
+    psd = frame.setup.options.number("acceleration_psd")
+    return Preintegration(columns_of("velocity", rows), track, psd, frame.gap)
 
 
 def _turns(
     buffer: Buffer, attitudes: list[Entry], gyro: GyroTrack | None, begin: float, end: float
-) -> AttitudeTrack:
-    """Attitude that body velocities are turned by within an interval: its turns alone count."""
+) -> tuple[AttitudeTrack, float]:
+    """Attitude that body velocities are turned by, of which the turns alone count, and its noise.
+
+    The noise is white, rad; where the nodes' attitude has it in common it is none.
+    """
     if attitudes:
-        return AttitudeTrack(columns_of("attitude", attitudes))
+        return AttitudeTrack(columns_of("attitude", attitudes)), 0.0
     if gyro is not None:
-        return AttitudeTrack.of(gyro.t, gyro.rotations)
+        return AttitudeTrack.of(gyro.t, gyro.rotations), 0.0
     compass = _around(buffer, "heading", begin, end, usual_gap(buffer, "heading"))
     if compass:
         rows = columns_of("heading", compass)
-        return AttitudeTrack(Attitude(rows.t, rows.heading))
-    return AttitudeTrack(None)
+        return AttitudeTrack(Attitude(rows.t, rows.heading)), float(np.median(rows.sigma))
+    return AttitudeTrack(None), 0.0
 
 
 def _around(buffer: Buffer, kind: str, begin: float, end: float, gap: float) -> list[Entry]:

@@ -19,7 +19,9 @@ from ubl_graph.arrays import FloatArray
 from ubl_graph.factors.block import LinearBlock
 from ubl_graph.factors.poses import PoseNodes
 from ubl_graph.layout import POSE_PLACES
+from ubl_graph.mission import Start, Vehicle
 from ubl_graph.nodes import grid
+from ubl_graph.online.buffer import Buffer
 from ubl_graph.online.frame import Frame
 from ubl_graph.pose_assembly import motion_slopes, world_slopes
 from ubl_graph.pose_path import Poses, between, path_rates, path_weights
@@ -55,6 +57,21 @@ def nearest_vector(rotation: FloatArray, near: FloatArray) -> FloatArray:
     )
     turns = np.round((np.einsum("mi,mi->m", near, axis) - length) / (2.0 * np.pi))
     return vector + 2.0 * np.pi * turns[:, None] * axis
+
+
+def heights_of(buffer: Buffer, vehicle: Vehicle) -> FloatArray:
+    """Times and ups (M, 2), s and m, at which a planar vehicle was: by depth, else by fixes."""
+    depths = [e for e in buffer.of("depth") if not e.gated]
+    if depths:
+        arm = vehicle.depth_sensor.body[2]
+        return np.array([[e.t, -e.values[1] - arm] for e in depths])
+    fixes = [e for e in buffer.of("position") if not e.gated and e.values[1].shape[1] == 3]
+    if fixes:
+        arm = vehicle.antenna.body[2]
+        return np.array([[e.t, e.values[1][0, 2] - arm] for e in fixes])
+    set_ = [e for e in buffer.of("set_position") if isinstance(e.record, Start)]
+    known = [[e.t, e.record.up] for e in set_ if getattr(e.record, "up", None) is not None]
+    return np.array(known, dtype=np.float64).reshape(-1, 2)
 
 
 def put_poses(frame: Frame, nodes: FloatArray, poses: Poses, near: FloatArray | None) -> None:

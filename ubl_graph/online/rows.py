@@ -24,10 +24,11 @@ from ubl_graph.nodes import grid
 from ubl_graph.online.buffer import Buffer, columns_of, fixes_of
 from ubl_graph.online.frame import Break, Frame
 from ubl_graph.online.pose_rows import CONSTANT_SPAN, jump_block, linearised, pose_blocks
+from ubl_graph.pose_builder import PoseBuilder
 from ubl_graph.trajectory import transition
 
 #: Blocks that speak of nodes one by one.
-NODE_BLOCKS = ("velocity", "water velocity", "attitude", "rate")
+NODE_BLOCKS = ("velocity", "water velocity", "attitude", "rate", "upright")
 #: The attitude of a vehicle that has not told it, and whose sensors do not ask for it.
 LEVEL = AttitudeTrack(None)
 
@@ -73,12 +74,12 @@ def interval_rows(
         return np.repeat(rows, count, axis=0), np.repeat(targets, count, axis=0)
     layout = frame.layout(grid(first, count + 1, frame.spacing))
     builder, chain = frame.builder(layout), layout.chains[0]
-    if frame.is_posed:
-        blocks = pose_blocks(frame, buffer, builder, chain)
+    if isinstance(builder, PoseBuilder):
+        linear = pose_blocks(frame, buffer, builder, chain, x)
     else:
-        model, some = _modelled(frame, buffer, builder, chain)
-        blocks = some + builder.linear_blocks(chain, model, CONSTANT_SPAN)
-    linear = [linearised(block, x) for block in blocks if len(block.columns)]
+        model, blocks = _modelled(frame, buffer, builder, chain)
+        blocks += builder.linear_blocks(chain, model, CONSTANT_SPAN)
+        linear = [linearised(block, x) for block in blocks if len(block.columns)]
     kept = [_stacked(block, frame, count) for block in linear]
     broken = [k - first for k in breaks if first <= k < first + count]
     if broken:
@@ -195,7 +196,8 @@ def _stacked(
     m, r, _ = matrix.shape
     dense = np.zeros((m, r, frame.interval + 1))
     dense[np.arange(m)[:, None, None], np.arange(r)[None, :, None], local[:, None, :]] = matrix
-    return np.repeat(owner, r), dense[..., :-1].reshape(m * r, -1), target.reshape(-1)
+    rows = dense[..., :-1].reshape(m * r, frame.interval)
+    return np.repeat(owner, r), rows, target.reshape(-1)
 
 
 def triangle(rows: FloatArray) -> FloatArray:

@@ -25,7 +25,7 @@ from ubl_graph.online.buffer import PINGS, Buffer, Entry, columns_of
 from ubl_graph.online.equations import LinearRows, WindowEquations
 from ubl_graph.online.frame import Break, Frame
 from ubl_graph.online.pose_rows import linearised, tolerances
-from ubl_graph.online.pose_state import leap_block, moved_on, poses_of, put_poses
+from ubl_graph.online.pose_state import heights_of, leap_block, moved_on, poses_of, put_poses
 from ubl_graph.online.rows import LEVEL, attitude_over, interval_rows, triangle
 from ubl_graph.trajectory import transition
 
@@ -297,15 +297,13 @@ class Window:
         return np.concatenate([nodes[:-1], nodes[1:], shared], axis=1)
 
     def _hold_up(self) -> None:
-        """Hold planar nodes where the depth sensor says."""
-        depths = [e for e in self._buffer.of("depth") if not e.gated]
-        if not self.frame.is_planar or not depths:
+        """Hold planar nodes where the depth sensor says, or else fixes, or who set a position."""
+        heights = heights_of(self._buffer, self.frame.setup.vehicle)
+        if not self.frame.is_planar or not len(heights):
             return
-        t, depth = np.array([e.values[:2] for e in depths]).T
-        arm = self.frame.setup.vehicle.depth_sensor.body[2]
-        fresh = self.times >= t[0]
-        fresh |= self.is_pristine
-        self.up[fresh] = -np.interp(self.times[fresh], t, depth) - arm
+        t, up = heights.T
+        fresh = (self.times >= t[0]) | self.is_pristine
+        self.up[fresh] = np.interp(self.times[fresh], t, up)
 
     def drop(self, pings: Sequence[RowsOf]) -> None:
         """Eliminate the first node.

@@ -15,9 +15,8 @@ from ubl_graph.solve.rounds import Engine
 
 #: Up to so many nodes `auto` has GTSAM confirm the answer: it takes a second or less.
 GTSAM_NODES = 5000
-#: Rows of poses that are not GTSAM's own, up to which it does: each takes some tenths of a
-#: millisecond alone.
-GTSAM_POSE_ROWS = 4000
+#: Rows of poses that are not GTSAM's own, up to which it does: a second or less, too.
+GTSAM_POSE_ROWS = 8000
 #: Shared unknowns that the banded solver takes: its border is dense, each one costs a solve.
 MOST_SHARED = 64
 #: Entries of the band that fit: 2 GB, and as much again several times over for the solution. The
