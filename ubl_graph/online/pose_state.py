@@ -69,8 +69,8 @@ def heights_of(buffer: Buffer, vehicle: Vehicle) -> FloatArray:
     if fixes:
         arm = vehicle.antenna.body[2]
         return np.array([[e.t, e.values[1][0, 2] - arm] for e in fixes])
-    set_ = [e for e in buffer.of("set_position") if isinstance(e.record, Start)]
-    known = [[e.t, e.record.up] for e in set_ if getattr(e.record, "up", None) is not None]
+    told = [e.record for e in buffer.of("set_position")]
+    known = [[r.t, r.up] for r in told if isinstance(r, Start) and r.up is not None]
     return np.array(known, dtype=np.float64).reshape(-1, 2)
 
 
