@@ -71,7 +71,7 @@ class PoseBuilder(Builder):
         """All that ties the nodes of one segment, but for what they share."""
         blocks = super().segment_blocks(chain, model)
         if _moves_unseen(model):
-            blocks.append(self._forward(chain))
+            blocks.append(self.forward(chain))
         leaning = self._leans(model.segment)
         return [*blocks, self.upright(chain)] if leaning else blocks
 
@@ -89,7 +89,7 @@ class PoseBuilder(Builder):
         ends = (self._nodes(k),)
         return PoseBlock("upright", ends, pose_motion.upright(), white, np.arange(3))
 
-    def _forward(self, chain: Chain) -> Block:
+    def forward(self, chain: Chain) -> Block:
         """The bow is where the vehicle goes: what holds a heading that nothing tells."""
         columns = self.layout.node_columns("velocity", np.array([chain.first]))[:, 1:]
         sigma = np.full(columns.shape, SIDEWAYS)

@@ -59,6 +59,12 @@ def nearest_vector(rotation: FloatArray, near: FloatArray) -> FloatArray:
     return vector + 2.0 * np.pi * turns[:, None] * axis
 
 
+def is_turned(buffer: Buffer) -> bool:
+    """Whether anything in the buffer tells how the vehicle turns, or what it does in its axes."""
+    kinds = ("attitude", "heading", "angular_rate", "odometry", "velocity")
+    return any(buffer.of(kind) for kind in kinds)
+
+
 def heights_of(buffer: Buffer, vehicle: Vehicle) -> FloatArray:
     """Times and ups (M, 2), s and m, at which a planar vehicle was: by depth, else by fixes."""
     depths = [e for e in buffer.of("depth") if not e.gated]

@@ -25,8 +25,16 @@ from ubl_graph.online.buffer import PINGS, Buffer, Entry, columns_of
 from ubl_graph.online.equations import LinearRows, WindowEquations
 from ubl_graph.online.frame import Break, Frame
 from ubl_graph.online.pose_rows import linearised, tolerances
-from ubl_graph.online.pose_state import heights_of, leap_block, moved_on, poses_of, put_poses
+from ubl_graph.online.pose_state import (
+    heights_of,
+    is_turned,
+    leap_block,
+    moved_on,
+    poses_of,
+    put_poses,
+)
 from ubl_graph.online.rows import LEVEL, attitude_over, interval_rows, triangle
+from ubl_graph.pose_builder import PoseBuilder
 from ubl_graph.trajectory import transition
 
 
@@ -472,6 +480,8 @@ class Window:
         builder, x = self.frame.builder(self.layout), self.vector
         chain = self.layout.chains[0]
         blocks = [*builder.first_priors(chain), *builder.shared_priors()]
+        if isinstance(builder, PoseBuilder) and not is_turned(self._buffer):
+            blocks.append(builder.forward(chain))
         return [linearised(b, x) for b in blocks]
 
     def _first_prior(self) -> tuple[FloatArray, FloatArray]:
