@@ -72,8 +72,8 @@ class PoseTrajectory(Trajectory):
     """
 
     rotation: FloatArray = None  # pyright: ignore[reportAssignmentType] - the parent has defaults
-    rate: FloatArray = None  # pyright: ignore[reportAssignmentType]
-    motion: NodeCovariance = None  # pyright: ignore[reportAssignmentType]
+    rate: FloatArray = None  # pyright: ignore[reportAssignmentType] - likewise
+    motion: NodeCovariance = None  # pyright: ignore[reportAssignmentType] - likewise
     still: bool = False
     turning_psd: float = 0.0
     planar: bool = False

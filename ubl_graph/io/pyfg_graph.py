@@ -136,7 +136,7 @@ class Rows:
             for name in ("name", "values", "covariance", "t")
         )
 
-    __hash__ = None  # pyright: ignore[reportAssignmentType]
+    __hash__ = None  # pyright: ignore[reportAssignmentType] - arrays do not hash
 
     @property
     def first(self) -> list[str]:
