@@ -59,6 +59,17 @@ class Block(Protocol):
         ...
 
 
+class CurvedBlock:
+    """What nonlinear blocks without a loss have in common: nothing is held while a solve runs."""
+
+    linear = False
+    robust = False
+
+    def frozen(self, x: FloatArray) -> FloatArray | None:  # noqa: ARG002 - the protocol's form
+        """Nothing is held."""
+        return None
+
+
 @dataclass(frozen=True, eq=False)
 class LinearBlock:
     """Whitened residuals A x - b.

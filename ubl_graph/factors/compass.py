@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from ubl_graph.arrays import FloatArray
-from ubl_graph.factors.block import ALL_ROWS
+from ubl_graph.factors.block import ALL_ROWS, CurvedBlock
 from ubl_graph.factors.tips import PosesAt
 from ubl_graph.layout import Interpolation
 
 
-class CompassBlock:
+class CompassBlock(CurvedBlock):
     """Whitened heading residuals: heading of the pose plus bias minus reading, one component.
 
     Parameters
@@ -24,9 +24,6 @@ class CompassBlock:
     name : str
         What the block is.
     """
-
-    linear = False
-    robust = False
 
     def __init__(
         self,
@@ -46,10 +43,6 @@ class CompassBlock:
     def log_det(self) -> float:
         """Sum of the logarithms of what whitens the rows."""
         return -float(np.log(self._sigma).sum())
-
-    def frozen(self, x: FloatArray) -> FloatArray | None:  # noqa: ARG002 - the protocol's form
-        """Nothing is held."""
-        return None
 
     def evaluate(
         self,

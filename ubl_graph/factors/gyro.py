@@ -70,11 +70,6 @@ class GyroTrack:
         self._variance = np.concatenate([[0.0], np.cumsum(noise)])
         self._missing = np.concatenate([[0.0], np.cumsum(np.where(self._open, 0.0, gaps))])
 
-    def breaks(self) -> FloatArray:
-        """Sample times at which coverage starts or ends, s: nodes should stand there."""
-        closed = np.flatnonzero(~self._open)
-        return self.t[np.concatenate([[0], closed, closed + 1, [len(self.t) - 1]])]
-
     def between(self, t0: FloatArray, t1: FloatArray) -> Turns:
         """Turns from `t0` to `t1`, (M,) each, s."""
         first, last = (np.clip(t, self.t[0], self.t[-1]) for t in (t0, t1))

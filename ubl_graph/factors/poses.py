@@ -14,7 +14,7 @@ import numpy as np
 
 from ubl_graph import lie
 from ubl_graph.arrays import FloatArray, IntArray
-from ubl_graph.factors.block import ALL_ROWS
+from ubl_graph.factors.block import ALL_ROWS, CurvedBlock
 from ubl_graph.layout import POSE_PLACES, Layout
 from ubl_graph.pose_path import Poses
 
@@ -67,7 +67,7 @@ PoseResidual = Callable[
 ]
 
 
-class PoseBlock:
+class PoseBlock(CurvedBlock):
     """Whitened residuals of poses at nodes.
 
     Parameters
@@ -87,9 +87,6 @@ class PoseBlock:
     units : array, shape (E,), optional
         SI value of one in each of those columns.
     """
-
-    linear = False
-    robust = False
 
     def __init__(
         self,
@@ -112,10 +109,6 @@ class PoseBlock:
     def log_det(self) -> float:
         """Sum of the logarithms of what whitens the rows."""
         return float(np.linalg.slogdet(self._whitening)[1].sum())
-
-    def frozen(self, x: FloatArray) -> FloatArray | None:  # noqa: ARG002 - the protocol's form
-        """Nothing is held."""
-        return None
 
     def evaluate(
         self,

@@ -13,7 +13,7 @@ import numpy as np
 
 from ubl_graph import lie
 from ubl_graph.arrays import FloatArray, IntArray
-from ubl_graph.factors.block import ALL_ROWS
+from ubl_graph.factors.block import ALL_ROWS, CurvedBlock
 from ubl_graph.factors.poses import PoseNodes
 from ubl_graph.layout import Chain, Layout
 from ubl_graph.pose_path import Poses, between, path_weights, still_weights
@@ -196,7 +196,7 @@ class PoseAntenna:
         return variance.reshape(-1, self.legs).sum(axis=1)
 
 
-class TipBlock:
+class TipBlock(CurvedBlock):
     """Whitened residuals of points fixed to the vehicle: what was measured of their places.
 
     Parameters
@@ -212,9 +212,6 @@ class TipBlock:
     covariance : array, shape (M, R, R)
         m^2; that of the motion between the nodes is added.
     """
-
-    linear = False
-    robust = False
 
     def __init__(
         self,
@@ -235,10 +232,6 @@ class TipBlock:
     def log_det(self) -> float:
         """Sum of the logarithms of what whitens the rows."""
         return float(np.linalg.slogdet(self._whitening)[1].sum())
-
-    def frozen(self, x: FloatArray) -> FloatArray | None:  # noqa: ARG002 - the protocol's form
-        """Nothing is held."""
-        return None
 
     def evaluate(
         self,

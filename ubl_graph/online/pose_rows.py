@@ -15,7 +15,7 @@ from ubl_graph.arrays import BoolArray, FloatArray
 from ubl_graph.attitude import AttitudeTrack
 from ubl_graph.builder import Builder, SegmentModel
 from ubl_graph.factors import pose_motion
-from ubl_graph.factors.block import ALL_ROWS, Block, LinearBlock
+from ubl_graph.factors.block import ALL_ROWS, Block, CurvedBlock, LinearBlock
 from ubl_graph.factors.gyro import GyroTrack
 from ubl_graph.factors.odometry import Preintegration, longest_gap_of
 from ubl_graph.factors.poses import PoseBlock, PoseNodes
@@ -159,7 +159,7 @@ def _newest_attitude(frame: Frame, buffer: Buffer, builder: Builder, chain: Chai
     return AttitudeBlock(poses, track.at(at), sigma, bias, planar=frame.is_planar)
 
 
-class AttitudeBlock:
+class AttitudeBlock(CurvedBlock):
     """Whitened residuals of attitudes at any times: Log(measured' Rz(-bias) R).
 
     Parameters
@@ -177,8 +177,6 @@ class AttitudeBlock:
     """
 
     name = "newest attitude"
-    linear = False
-    robust = False
 
     def __init__(
         self,
@@ -200,10 +198,6 @@ class AttitudeBlock:
     def log_det(self) -> float:
         """Sum of the logarithms of what whitens the rows."""
         return -len(self._keep) * float(np.log(self._sigma).sum())
-
-    def frozen(self, x: FloatArray) -> FloatArray | None:  # noqa: ARG002 - the protocol's form
-        """Nothing is held."""
-        return None
 
     def evaluate(
         self,
