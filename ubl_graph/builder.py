@@ -15,7 +15,13 @@ from ubl_graph.factors import linear
 from ubl_graph.factors.block import Block
 from ubl_graph.factors.gyro import GyroTrack
 from ubl_graph.factors.odometry import DVL_STATES, Preintegration, node_velocity, odometry
-from ubl_graph.factors.ranges import Antenna, PointAntenna, RangeBlock
+from ubl_graph.factors.ranges import (
+    Antenna,
+    FixedAntenna,
+    FreeAntenna,
+    PointAntenna,
+    RangeBlock,
+)
 from ubl_graph.layout import Chain, Interpolation, Layout
 from ubl_graph.measurements import OneWayRange, PositionFix, SlantRange
 from ubl_graph.mission import Segment, Setup, Start
@@ -350,10 +356,13 @@ class Builder:
         times = leg_times(pings)
         legs_at = times.ravel()
         which = self.setup.beacon_numbers(pings.beacon)
-        beacon_columns = None
+        there: Antenna
         if self.options.estimate_beacons:
             each = [self.layout.shared_columns(f"beacon {n}") for n in self.setup.beacon_names]
-            beacon_columns = np.stack(each)[which]
+            there = FreeAntenna(np.stack(each)[which], times.shape[1])
+        else:
+            places = np.stack([b.position for b in self.setup.beacons])[which]
+            there = FixedAntenna(places, times.shape[1])
         sound_speed = clock = None
         if self.layout.has("sound_speed"):
             sound_speed = self.layout.slow_at("sound_speed", chain, legs_at)
@@ -365,12 +374,11 @@ class Builder:
             chain.name,
             along_distances if isinstance(pings, SlantRange) else self.travel_times,
             self.antenna(chain, times, attitude),
-            np.stack([b.position for b in self.setup.beacons])[which],
+            there,
             measured,
             sigma,
             sound_speed,
             clock,
-            beacon_columns,
         )
 
     def _variance(self, position: Interpolation) -> FloatArray:

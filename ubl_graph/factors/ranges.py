@@ -5,10 +5,11 @@ vehicle at receive time, a one-way one from the beacon to the vehicle at receive
 the acoustic time of one leg, g the logarithm of the sound-speed scale's effect and c the clock
 offset (one-way only),
 
-    residual = sum over legs of tau(antenna at its time, beacon) exp(g at its time) + c - measured
+    residual = sum over legs of tau(antenna at its time, other end) exp(g at its time) + c - measured
 
-The residual sees antenna positions and their derivatives alone; how a position is made of node
-states is the layout's business (`Interpolation`).
+The other end is a beacon, known or not, a target, or another vehicle. The residual sees the
+positions of both ends and their derivatives alone; how a position is made of node states is the
+layout's business (`Interpolation`).
 """
 
 from __future__ import annotations
@@ -99,6 +100,58 @@ class PointAntenna:
         return (gradient**2 * self._variance).sum(axis=(1, 2))
 
 
+class FixedAntenna:
+    """Known places, the same at the L legs of a ping: beacons that are no unknowns.
+
+    Parameters
+    ----------
+    places : array, shape (M, 3)
+        East, north, up, m.
+    legs : int
+        Legs L of a ping.
+    """
+
+    def __init__(self, places: FloatArray, legs: int) -> None:
+        self.legs = legs
+        self.columns = np.empty((len(places), 0), dtype=np.int64)
+        self._places = np.repeat(places[:, None, :], legs, axis=1)
+
+    def positions(self, x: FloatArray, rows: slice) -> tuple[FloatArray, None]:  # noqa: ARG002 - the protocol's form
+        """Positions (m, L, 3), m."""
+        return self._places[rows], None
+
+    def slopes(self, gradient: FloatArray, terms: None, rows: slice) -> FloatArray:  # noqa: ARG002 - the protocol's form
+        """Nothing to derive by, (m, 0)."""
+        return np.empty((len(gradient), 0))
+
+    def variance(self, gradient: FloatArray, terms: None) -> FloatArray:  # noqa: ARG002 - the protocol's form
+        """Nothing moves: zeros (M,)."""
+        return np.zeros(len(gradient))
+
+
+class FreeAntenna(FixedAntenna):
+    """Unknown places, the same at the L legs of a ping: beacons and targets at rest.
+
+    Parameters
+    ----------
+    columns : array of int, shape (M, 3)
+        Where they stand in the flat vector.
+    legs : int
+        Legs L of a ping.
+    """
+
+    def __init__(self, columns: IntArray, legs: int) -> None:
+        self.legs, self.columns = legs, columns
+
+    def positions(self, x: FloatArray, rows: slice) -> tuple[FloatArray, None]:
+        """Positions (m, L, 3) at `x`, m."""
+        return np.repeat(x[self.columns[rows]][:, None, :], self.legs, axis=1), None
+
+    def slopes(self, gradient: FloatArray, terms: None, rows: slice) -> FloatArray:  # noqa: ARG002 - the protocol's form
+        """Derivatives (m, 3) by the columns, given those by the positions (m, L, 3)."""
+        return gradient.sum(axis=1)
+
+
 class RangeBlock:
     """Residuals of M pings, one whitened component each.
 
@@ -107,13 +160,13 @@ class RangeBlock:
     name : str
         "two_way_range", "one_way_range" or "slant_range".
     chain : str
-        Name of the chain whose pings they are.
+        Name of the chain whose pings they are; empty where they join several.
     model : callable
-        Acoustic times and gradients of (N, 3) antenna and (N, 3) beacon positions.
-    antenna : Antenna
+        Acoustic times and gradients of the two ends' positions, (N, 3) each.
+    here : Antenna
         Where the transducer is at each leg's time.
-    beacons : array, shape (M, 3)
-        Beacon positions, ENU m; where beacons are estimated, only their starting values.
+    there : Antenna
+        Where the other end is: `FixedAntenna`, `FreeAntenna`, or that of another vehicle.
     measured : array, shape (M,)
         Travel time, s, without turnaround; as stamped for one-way ranges.
     sigma : array, shape (M,)
@@ -121,9 +174,7 @@ class RangeBlock:
     sound_speed : Interpolation, optional
         Of the log scale at each leg's time (M * L rows, one component).
     clock : Interpolation, optional
-        Of the clock offset at the receive time (M rows, one component).
-    beacon_columns : array of int, shape (M, 3), optional
-        Where beacons are unknowns.
+        Of the clock offset at the receive time, receiver's minus sender's (M rows, one component).
     """
 
     linear = False
@@ -135,30 +186,24 @@ class RangeBlock:
         name: str,
         chain: str,
         model: TravelTimeModel,
-        antenna: Antenna,
-        beacons: FloatArray,
+        here: Antenna,
+        there: Antenna,
         measured: FloatArray,
         sigma: FloatArray,
         sound_speed: Interpolation | None = None,
         clock: Interpolation | None = None,
-        beacon_columns: IntArray | None = None,
     ) -> None:
         self.name = name
         self.chain = chain
         self.model = model
         self.measured = measured
         self.sigma = sigma
-        self.antenna = antenna
-        m, n_legs = len(measured), antenna.legs
+        self._here, self._there = here, there
+        m, n_legs = len(measured), here.legs
         self._sound_speed = None if sound_speed is None else by_leg(sound_speed, m, n_legs)
         self._clock = None if clock is None else by_leg(clock, m, 1)
-        self._beacons = np.repeat(beacons[:, None, :], n_legs, axis=1)
-        self._beacon_columns = beacon_columns
-        parts = [antenna.columns]
-        slow = (self._sound_speed, self._clock)
-        parts += [part[0].reshape(m, -1) for part in slow if part is not None]
-        if beacon_columns is not None:
-            parts.append(beacon_columns)
+        slow = [part for part in (self._sound_speed, self._clock) if part is not None]
+        parts = [here.columns, *(part[0].reshape(m, -1) for part in slow), there.columns]
         self.columns = np.concatenate(parts, axis=1)
 
     def __len__(self) -> int:
@@ -171,7 +216,8 @@ class RangeBlock:
         `x`.
         """
         terms = self._model_terms(x, ALL_ROWS)
-        return np.sqrt(self.sigma**2 + self.antenna.variance(terms.slopes, terms.antenna))
+        here = self._here.variance(terms.slopes, terms.here)
+        return np.sqrt(self.sigma**2 + here + self._there.variance(terms.back, terms.there))
 
     def found(self, x: FloatArray) -> BoolArray:
         """Whether a direct ray exists for all legs of each ping, (M,)."""
@@ -192,49 +238,45 @@ class RangeBlock:
         if not jacobian:
             return residual, None
         m = len(terms.total)
-        parts = [self.antenna.slopes(terms.slopes, terms.antenna, rows)]
+        parts = [self._here.slopes(terms.slopes, terms.here, rows)]
         if self._sound_speed is not None:
             parts.append((terms.times[..., None] * self._sound_speed[1][rows]).reshape(m, -1))
         if self._clock is not None:
             parts.append(self._clock[1][rows].reshape(m, -1))
-        if self._beacon_columns is not None:
-            back = terms.travel.gradient_b.reshape(terms.slopes.shape)
-            parts.append((back * terms.scale[..., None]).sum(axis=1))
+        if self._there.columns.shape[1]:
+            parts.append(self._there.slopes(terms.back, terms.there, rows))
         jacobians = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
         return residual, (jacobians / sigma[:, None])[:, None, :]
 
     def _model_terms(self, x: FloatArray, rows: slice) -> _Terms:
-        antenna, held = self.antenna.positions(x, rows)
-        m, n_legs = antenna.shape[:2]
-        if self._beacon_columns is None:
-            beacon = self._beacons[rows]
-        else:
-            beacon = np.repeat(x[self._beacon_columns[rows]][:, None, :], n_legs, axis=1)
-        travel = self.model(antenna.reshape(-1, 3), beacon.reshape(-1, 3))
+        here, held = self._here.positions(x, rows)
+        there, held_there = self._there.positions(x, rows)
+        m, n_legs = here.shape[:2]
+        travel = self.model(here.reshape(-1, 3), there.reshape(-1, 3))
         times = travel.time.reshape(m, n_legs)
-        slopes = travel.gradient_a.reshape(m, n_legs, 3)
-        scale = np.ones_like(times)
+        slopes, back = (g.reshape(m, n_legs, 3) for g in (travel.gradient_a, travel.gradient_b))
         if self._sound_speed is not None:
             columns, weights = self._sound_speed[0][rows], self._sound_speed[1][rows]
             scale = np.exp((x[columns[..., 0]] * weights).sum(axis=2))
             times = times * scale
-            slopes = slopes * scale[..., None]
+            slopes, back = slopes * scale[..., None], back * scale[..., None]
         total = times.sum(axis=1)
         if self._clock is not None:
             columns, weights = self._clock[0][rows], self._clock[1][rows]
             total = total + (x[columns[..., 0]] * weights).sum(axis=(1, 2))
-        return _Terms(total, times, slopes, scale, travel, held)
+        return _Terms(total, times, slopes, back, travel, held, held_there)
 
 
 class _Terms(NamedTuple):
-    """What a residual is made of: sums, legs, and what the antenna remembers of its positions."""
+    """What a residual is made of: sums, legs, and what the ends remember of their positions."""
 
     total: FloatArray  # (m,), s
     times: FloatArray  # (m, L), s
-    slopes: FloatArray  # (m, L, 3), s/m
-    scale: FloatArray  # (m, L)
+    slopes: FloatArray  # (m, L, 3), s/m, by the positions here
+    back: FloatArray  # (m, L, 3), s/m, by those there
     travel: TravelTimes
-    antenna: Any
+    here: Any
+    there: Any
 
 
 def by_leg(part: Interpolation, m: int, n_legs: int) -> tuple[IntArray, FloatArray]:
