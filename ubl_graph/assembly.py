@@ -13,9 +13,9 @@ from ubl_graph.mission import Mission
 from ubl_graph.options import Options
 from ubl_graph.pings import Pings, measured_times
 from ubl_graph.pose_assembly import pose_trajectory
-from ubl_graph.problem import Problem
+from ubl_graph.problem import LeastSquares, Problem
 from ubl_graph.result import RangeResiduals, SegmentResult, Shared, SlowState, Status
-from ubl_graph.solve.marginals import Marginals
+from ubl_graph.solve.marginals import Covariances
 from ubl_graph.solve.rounds import Solution
 from ubl_graph.trajectory import NodeCovariance, Trajectory
 
@@ -29,7 +29,7 @@ UNOBSERVED_SIGMA = 1000.0
 def assemble_segment(
     problem: Problem,
     solution: Solution,
-    marginals: Marginals,
+    marginals: Covariances,
     chain: Chain,
     model: SegmentModel,
     rival: str | None,
@@ -38,6 +38,7 @@ def assemble_segment(
     solver: str,
     runner_up: float | None,
     options: Options,
+    limit: float | None = None,
 ) -> SegmentResult:
     """Everything that a user reads of one segment.
 
@@ -59,6 +60,9 @@ def assemble_segment(
         How much dearer the next best track elsewhere is.
     options : Options
         Of the mission.
+    limit : float, optional
+        Standard deviation beyond which a position counts as not observed, m; left out, half the
+        typical range.
     """
     layout = problem.layout
     if layout.node == "point":
@@ -67,10 +71,11 @@ def assemble_segment(
         trajectory = pose_trajectory(problem, solution.x, marginals, chain, options)
     slow = {name: _slow_state(problem, solution, marginals, chain, name) for name, _ in layout.slow}
     residuals = _range_residuals(problem, solution, chain, model)
-    limit = _unobserved_sigma(residuals, slow.get("clock_offset"))
+    if limit is None:
+        limit = _unobserved_sigma(residuals, slow.get("clock_offset"))
     unresolved = marginals.unresolved[chain.nodes]
     status, reason = _status(solution, trajectory, limit, unresolved, rival)
-    chi_square, dof = _chi_square(problem, solution)
+    chi_square, dof = chi_square_of(problem, solution)
     return SegmentResult(
         chain.name,
         trajectory,
@@ -90,7 +95,7 @@ def assemble_segment(
 
 
 def _point_trajectory(
-    problem: Problem, solution: Solution, marginals: Marginals, chain: Chain
+    problem: Problem, solution: Solution, marginals: Covariances, chain: Chain
 ) -> Trajectory:
     """The trajectory of a chain of point nodes."""
     layout = problem.layout
@@ -110,7 +115,7 @@ def _point_trajectory(
     )
 
 
-def shared_of(problem: Problem, solution: Solution, marginals: Marginals) -> dict[str, Shared]:
+def shared_of(problem: Problem, solution: Solution, marginals: Covariances) -> dict[str, Shared]:
     """Estimates of what all nodes share."""
     return {
         name: Shared(problem.layout.get(solution.x, name), marginals.of(name))
@@ -127,7 +132,7 @@ def beacons_of(mission: Mission, shared: dict[str, Shared]) -> dict[str, Shared]
 
 
 def _slow_state(
-    problem: Problem, solution: Solution, marginals: Marginals, chain: Chain, name: str
+    problem: Problem, solution: Solution, marginals: Covariances, chain: Chain, name: str
 ) -> SlowState:
     variance = np.einsum("nii->ni", marginals.of(name)[chain.nodes])
     return SlowState(chain.t, problem.layout.get(solution.x, name)[chain.nodes], np.sqrt(variance))
@@ -205,7 +210,7 @@ def direction(axis: FloatArray) -> str:
     return f"along {bearing}/{bearing + 180} degrees"
 
 
-def _chi_square(problem: Problem, solution: Solution) -> tuple[float, int]:
+def chi_square_of(problem: LeastSquares, solution: Solution) -> tuple[float, int]:
     """Weighted sum of squared whitened residuals, and rows minus unknowns."""
     total, rows = 0.0, 0
     for block, frozen in zip(problem.blocks, solution.frozen, strict=True):

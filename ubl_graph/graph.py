@@ -43,11 +43,22 @@ def model_segment(segment: Segment, options: Options) -> SegmentModel:
     )
 
 
-def build_problem(mission: Mission, models: Sequence[SegmentModel]) -> Problem:
-    """The least-squares problem of some segments of a mission, all unknowns in one layout."""
-    layout = _layout(mission, models)
-    kind = Builder if layout.node == "point" else PoseBuilder
-    builder = kind(mission.setup, layout, _lasting(models))
+def build_problem(
+    mission: Mission, models: Sequence[SegmentModel], layout: Layout | None = None
+) -> Problem:
+    """The least-squares problem of some segments of a mission, all unknowns in one layout.
+
+    Parameters
+    ----------
+    mission : Mission
+        Whose segments.
+    models : sequence of SegmentModel
+        Of these segments.
+    layout : Layout, optional
+        Of `layout_of`, where it is not what the segments alone ask for.
+    """
+    layout = layout_of(mission, models) if layout is None else layout
+    builder = builder_of(mission, models, layout)
     blocks: list[Block] = []
     for chain, model in zip(layout.chains, models, strict=True):
         blocks += builder.segment_blocks(chain, model)
@@ -58,12 +69,27 @@ def build_problem(mission: Mission, models: Sequence[SegmentModel]) -> Problem:
     return Problem(layout, tuple(blocks), RobustLoss(options.loss), psd)
 
 
+def builder_of(mission: Mission, models: Sequence[SegmentModel], layout: Layout) -> Builder:
+    """What makes the blocks of some segments of a mission in a layout."""
+    kind = Builder if layout.node == "point" else PoseBuilder
+    return kind(mission.setup, layout, _lasting(models))
+
+
 def shares_unknowns(mission: Mission, models: Sequence[SegmentModel]) -> bool:
     """Whether segments have unknowns in common, and so belong into one problem."""
-    return bool(_layout(mission, models).shared)
+    return bool(layout_of(mission, models).shared)
 
 
-def _layout(mission: Mission, models: Sequence[SegmentModel]) -> Layout:
+def layout_of(mission: Mission, models: Sequence[SegmentModel], *, clocked: bool = False) -> Layout:
+    """The unknowns of some segments of a mission.
+
+    Parameters
+    ----------
+    mission, models
+        As `build_problem` takes them.
+    clocked : bool
+        Whether the vehicle's clock is an unknown although it hears no beacon: others hear it.
+    """
     options = mission.options
     chains: list[Chain] = []
     first = 0
@@ -75,7 +101,7 @@ def _layout(mission: Mission, models: Sequence[SegmentModel]) -> Layout:
     slow: list[tuple[str, int]] = []
     if options.estimate_sound_speed and has_ranges:
         slow.append(("sound_speed", 1))
-    if any("one_way_range" in r for r in records):
+    if clocked or any("one_way_range" in r for r in records):
         slow += [("clock_offset", 1), ("clock_drift", 1)]
     if any(model.water is not None for model in models):
         slow.append(("current", 2))

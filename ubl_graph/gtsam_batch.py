@@ -21,7 +21,7 @@ from ubl_graph import lie
 from ubl_graph.arrays import BoolArray, FloatArray, IntArray
 from ubl_graph.factors.block import Block
 from ubl_graph.factors.loss import RobustLoss
-from ubl_graph.layout import Layout, Variable
+from ubl_graph.layout import Columns, Variable
 
 #: GTSAM counts a pose's and a twist's components about the axes first.
 ABOUT_FIRST = [3, 4, 5, 0, 1, 2]
@@ -66,13 +66,13 @@ class Batch:
 
     Parameters
     ----------
-    layout : Layout
+    layout : Columns
         Of the problem.
     keys : sequence of int
         GTSAM's key of each of its variables.
     """
 
-    def __init__(self, layout: Layout, keys: Sequence[int]) -> None:
+    def __init__(self, layout: Columns, keys: Sequence[int]) -> None:
         self._layout, self._keys = layout, keys
         self._families = _families(layout)
         self._blocks: list[_Rows] = []
@@ -208,7 +208,7 @@ class Batch:
         return out
 
 
-def _families(layout: Layout) -> list[_Family]:
+def _families(layout: Columns) -> list[_Family]:
     """All variables, by how GTSAM holds them."""
     groups: dict[tuple[str, int], list[int]] = {}
     for n, variable in enumerate(layout.variables):

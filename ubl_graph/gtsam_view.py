@@ -24,8 +24,8 @@ from ubl_graph.factors.block import Block
 from ubl_graph.factors.loss import RobustLoss
 from ubl_graph.factors.poses import PoseMotion
 from ubl_graph.gtsam_batch import ABOUT_FIRST, Batch, Callback
-from ubl_graph.layout import Layout, Variable
-from ubl_graph.problem import Frozen, Problem
+from ubl_graph.layout import Columns, Variable
+from ubl_graph.problem import Frozen, LeastSquares
 
 #: GTSAM symbol of each kind of variable; beacons are b(j).
 LETTERS = {
@@ -53,7 +53,7 @@ class GraphView:
 
     Parameters
     ----------
-    problem : Problem
+    problem : LeastSquares
         What to look at.
     first : int
         Number of the first node under GTSAM's keys.
@@ -62,7 +62,7 @@ class GraphView:
         that were linearised by the columns are linear then.
     """
 
-    def __init__(self, problem: Problem, first: int = 0, *, charts: bool = False) -> None:
+    def __init__(self, problem: LeastSquares, first: int = 0, *, charts: bool = False) -> None:
         self.problem, self._charts = problem, charts
         layout = problem.layout
         self.keys: list[int] = keys_of(layout, first)
@@ -232,7 +232,7 @@ class GraphView:
         return evaluate
 
 
-def keys_of(layout: Layout, first: int = 0) -> list[int]:
+def keys_of(layout: Columns, first: int = 0) -> list[int]:
     """GTSAM keys of all variables, in the layout's order; nodes are counted from `first`."""
     beacons, shared = 0, dict(layout.shared)
     keys: list[int] = []
@@ -247,7 +247,7 @@ def keys_of(layout: Layout, first: int = 0) -> list[int]:
 
 
 def values_of(
-    layout: Layout, keys: Sequence[int], x: FloatArray, *, charts: bool = False
+    layout: Columns, keys: Sequence[int], x: FloatArray, *, charts: bool = False
 ) -> gtsam.Values:
     """gtsam.Values of the flat vector `x`; with `charts` poses are plain vectors."""
     values = gtsam.Values()

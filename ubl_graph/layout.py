@@ -100,8 +100,53 @@ class Chain:
         return slice(self.first, self.first + len(self.t))
 
 
+class Columns:
+    """What solvers ask of a layout.
+
+    Attributes
+    ----------
+    node : str
+        Kind of node; of a fleet any of poses, where it has some.
+    shared : tuple of (str, int)
+        Name and size of what all nodes share.
+    """
+
+    node: Node
+    shared: tuple[tuple[str, int], ...]
+
+    @cached_property
+    def node_count(self) -> int:
+        """Nodes in all."""
+        raise NotImplementedError
+
+    @cached_property
+    def node_width(self) -> int:
+        """Columns of one node, of the widest where they differ."""
+        raise NotImplementedError
+
+    @cached_property
+    def inner(self) -> int:
+        """Columns of all nodes; behind them stands what nodes share."""
+        raise NotImplementedError
+
+    @cached_property
+    def size(self) -> int:
+        """Columns in all."""
+        raise NotImplementedError
+
+    @cached_property
+    def variables(self) -> tuple[Variable, ...]:
+        """Every variable, in order of its columns."""
+        raise NotImplementedError
+
+    @cached_property
+    def variable_of_column(self) -> IntArray:
+        """Number of the variable that each column belongs to, shape (size,)."""
+        return np.repeat(np.arange(len(self.variables)), [v.size for v in self.variables])
+
+
 @dataclass(frozen=True, eq=False)
-class Layout:
+class Layout(Columns):
     """Columns of all unknowns.
 
     Attributes
@@ -161,9 +206,14 @@ class Layout:
         return sum(len(c.t) for c in self.chains)
 
     @cached_property
+    def inner(self) -> int:
+        """Columns of all nodes; behind them stands what the nodes share."""
+        return self.node_count * self.node_width
+
+    @cached_property
     def size(self) -> int:
         """Columns in all."""
-        return self.node_count * self.node_width + sum(size for _, size in self.shared)
+        return self.inner + sum(size for _, size in self.shared)
 
     @cached_property
     def _node_offset(self) -> dict[str, tuple[int, int]]:
@@ -177,7 +227,7 @@ class Layout:
     @cached_property
     def _shared_offset(self) -> dict[str, tuple[int, int]]:
         offsets: dict[str, tuple[int, int]] = {}
-        at = self.node_count * self.node_width
+        at = self.inner
         for name, size in self.shared:
             offsets[name] = (at, size)
             at += size
@@ -233,11 +283,6 @@ class Layout:
         ]
         out += [Variable(n, 0, at, size) for n, (at, size) in self._shared_offset.items()]
         return tuple(out)
-
-    @cached_property
-    def variable_of_column(self) -> IntArray:
-        """Number of the variable that each column belongs to, shape (size,)."""
-        return np.repeat(np.arange(len(self.variables)), [v.size for v in self.variables])
 
     def motion_columns(self, nodes: IntArray) -> IntArray:
         """Columns of all that `nodes` (M,) hold of the motion, shape (M, kinematic_width)."""

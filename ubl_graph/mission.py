@@ -194,6 +194,9 @@ class Mission:
         For titles and file headers.
     origin : GeodeticOrigin, optional
         Where the local frame sits on the Earth.
+    aided : bool
+        Whether others (vehicles of a fleet) may say where the vehicle is: then a segment needs no
+        range and no fix of its own.
 
     Raises
     ------
@@ -211,6 +214,7 @@ class Mission:
     options: Options = field(default_factory=Options)
     name: str = ""
     origin: GeodeticOrigin | None = None
+    aided: bool = False
 
     def __post_init__(self) -> None:
         check_names(self.beacons)
@@ -253,7 +257,8 @@ class Mission:
     def _check_segment(self, segment: Segment) -> None:
         records = segment.records()
         where = f"segment '{segment.name}'" if segment.name else "the mission"
-        check_located(tuple(records), where)
+        if not self.aided:
+            check_located(tuple(records), where)
         check_kinds(tuple(records), self.options, where)
         check_node(self.options, segment.start)
         for kind, rows in records.items():

@@ -14,12 +14,12 @@ from ubl_graph.options import Options
 from ubl_graph.pose_path import Poses
 from ubl_graph.pose_trajectory import PoseTrajectory
 from ubl_graph.problem import Problem
-from ubl_graph.solve.marginals import Marginals
+from ubl_graph.solve.marginals import Covariances
 from ubl_graph.trajectory import NodeCovariance
 
 
 def pose_trajectory(
-    problem: Problem, x: FloatArray, marginals: Marginals, chain: Chain, options: Options
+    problem: Problem, x: FloatArray, marginals: Covariances, chain: Chain, options: Options
 ) -> PoseTrajectory:
     """The trajectory of a chain of pose nodes, with covariances in the world's axes.
 

@@ -14,32 +14,29 @@ from scipy import sparse
 from ubl_graph.arrays import FloatArray, IntArray
 from ubl_graph.factors.block import Block
 from ubl_graph.factors.loss import RobustLoss
-from ubl_graph.layout import Layout
+from ubl_graph.layout import Columns, Layout
 
 #: What each block holds fixed while a solve runs, in the blocks' order.
 Frozen = tuple[FloatArray | None, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
-    """Layout, blocks and loss.
+class LeastSquares:
+    """What solvers see of a problem: columns, blocks and loss.
 
     Attributes
     ----------
-    layout : Layout
+    layout : Columns
         The unknowns.
     blocks : tuple of Block
         The residuals.
     loss : RobustLoss
         Applies to the blocks that are `robust`.
-    psd : tuple of float
-        Horizontal and vertical noise density of the motion prior, m^2/s^3 or m^2/s^5.
     """
 
-    layout: Layout
+    layout: Columns
     blocks: tuple[Block, ...]
     loss: RobustLoss
-    psd: tuple[float, float]
 
     def frozen(self, x: FloatArray) -> Frozen:
         """What the blocks hold fixed during a solve that starts at `x`."""
@@ -80,3 +77,19 @@ class Problem:
             shape=(first, self.layout.size),
         )
         return np.concatenate(residuals), matrix
+
+
+@dataclass(frozen=True, eq=False)
+class Problem(LeastSquares):
+    """The problem of one vehicle.
+
+    Attributes
+    ----------
+    layout : Layout
+        The unknowns.
+    psd : tuple of float
+        Horizontal and vertical noise density of the motion prior, m^2/s^3 or m^2/s^5.
+    """
+
+    layout: Layout
+    psd: tuple[float, float]

@@ -6,36 +6,27 @@ share nothing are solved one by one: one that the data leave open does not harm 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from time import perf_counter
-
-import numpy as np
 
 from ubl_graph.arrays import FloatArray
-from ubl_graph.assembly import assemble_segment, beacons_of, direction, shared_of
+from ubl_graph.assembly import assemble_segment, beacons_of, shared_of
 from ubl_graph.builder import SegmentModel
-from ubl_graph.errors import SolverError
 from ubl_graph.graph import build_problem, model_segment, shares_unknowns
 from ubl_graph.initial import START_LIMIT, Starts
-from ubl_graph.layout import Chain
 from ubl_graph.mission import Mission
 from ubl_graph.pose_initial import find_tracks
 from ubl_graph.problem import Problem
-from ubl_graph.result import DOWN_WEIGHTED, Result, SegmentResult, Shared
-from ubl_graph.solve.choice import Choice, choose
+from ubl_graph.result import Result, SegmentResult, Shared
+from ubl_graph.solve.choice import choose
 from ubl_graph.solve.marginals import Marginals
-from ubl_graph.solve.rounds import Engine, Solution, confirms, graduated, solve
+from ubl_graph.solve.rounds import Engine, Solution, graduated
 from ubl_graph.track import mirror_images, place, start_vector, track_of, unanchored
 from ubl_graph.tuning import Tuning, tuned
+from ubl_graph.work import Progress, Work, confirmed, down_weighted, rival_of
 
-#: A second track counts as no worse where its cost is higher by less than this: odds of 20 to 1.
-AMBIGUOUS_COST = 3.0
 #: Costs nearer than this are equal: two engines, or machines, round differently.
 SAME_COST = 1e-6
-#: A second track nearer than so many standard deviations is the same flat valley, not a rival.
-COVERED_SIGMAS = 3.0
 #: Where more pings than this are down-weighted, a graduated solve is tried as well.
 DOUBTFUL_SHARE = 0.01
 #: A profile may end so much above the deepest beacon, as a share of its depth.
@@ -44,9 +35,6 @@ PROFILE_SLACK = 0.1
 SUSPICIOUS_SHARE = 0.2
 #: Sigmas would have to be twice too small to explain this.
 SUSPICIOUS_CHI_SQUARE = 4.0
-
-#: Called with what is being done and how far the whole is, 0 to 1.
-Progress = Callable[[str, float], None]
 
 
 def smooth(mission: Mission, progress: Progress | None = None) -> Result:
@@ -79,7 +67,7 @@ def smooth(mission: Mission, progress: Progress | None = None) -> Result:
     >>> result.status
     'converged'
     """
-    work = _Work(mission, progress)
+    work = _Work(mission.options.max_iterations, progress, mission=mission)
     tuning = _tune(work)
     mission = work.mission
     _judge_profile(work)
@@ -178,7 +166,7 @@ def _smooth_group(
         results: list[SegmentResult] = []
         by_model = zip(group, (starts for _, starts in searched), strict=True)
         for chain, (model, starts) in zip(problem.layout.chains, by_model, strict=True):
-            rival, track, runner_up = _rival(problem, solution, marginals, rivals, chain)
+            rival, track, runner_up = rival_of(problem, solution, marginals, rivals, chain)
             if runner_up is None:
                 runner_up = starts.runner_up
             if len(group) == 1:
@@ -206,8 +194,8 @@ def _solved(
 ) -> tuple[Solution, list[Solution], str]:
     """The best solution, the others that were found, and who solved it."""
     choice = choose(problem, work.mission.options.solver)
-    best, others = _solve_from(work, choice.scout, group, starts)
-    best, solver, note = _confirmed(work, choice, best)
+    best, others = _solve_from(work, choice.scout, problem, group, starts)
+    best, solver, note = confirmed(work, choice, best)
     for text in filter(None, (choice.note, note)):
         work.warn(group[0].segment.name if len(group) == 1 else "", text)
     return best, others, solver
@@ -228,16 +216,19 @@ def _search(work: _Work, model: SegmentModel) -> tuple[SegmentModel, Starts]:
 
 
 def _solve_from(
-    work: _Work, engine: Engine, group: Sequence[SegmentModel], starts: Sequence[Starts]
+    work: _Work,
+    engine: Engine,
+    problem: Problem,
+    group: Sequence[SegmentModel],
+    starts: Sequence[Starts],
 ) -> tuple[Solution, list[Solution]]:
     """Solve from the best start, from the rivals of a single segment, and from mirror images.
 
     Returns the cheapest solution, and the others, cheapest first.
     """
-    problem = engine.problem
     begin = start_vector(work.mission, problem.layout, [s.tracks[0] for s in starts])
     solutions = [work.solve(engine, begin)]
-    if _down_weighted(problem, solutions[0]) > DOUBTFUL_SHARE:
+    if down_weighted(problem, solutions[0]) > DOUBTFUL_SHARE:
         solutions.append(work.solve(engine, graduated(engine, begin)))
         solutions.sort(key=lambda s: s.cost)
     layout = problem.layout
@@ -259,109 +250,8 @@ def _solve_from(
     return best, sorted((s for s in solutions if s is not best), key=lambda s: s.cost)
 
 
-def _confirmed(work: _Work, choice: Choice, found: Solution) -> tuple[Solution, str, str]:
-    """The scout's answer, shown to the other engine.
-
-    Returns the answer that counts, who gave it, and what a user should know of that.
-    """
-    scout, last = choice.scout, choice.last
-    if last is scout or not found.converged:
-        return found, scout.name, ""
-    try:
-        if confirms(last, found):
-            return found, f"{scout.name}, confirmed by {last.name}", ""
-        again = work.solve(last, found.x)
-    except SolverError as error:
-        note = f"{last.name} could not confirm the answer of {scout.name}: {error}"
-        return found, scout.name, note
-    return replace(again, iterations=found.iterations + again.iterations), last.name, ""
-
-
-def _down_weighted(problem: Problem, solution: Solution) -> float:
-    """Share of the robust rows that count for less than half."""
-    weights = [
-        problem.loss.weights(block.evaluate(solution.x, held, jacobian=False)[0])[:, 0]
-        for block, held in zip(problem.blocks, solution.frozen, strict=True)
-        if block.robust
-    ]
-    return float((np.concatenate(weights) < DOWN_WEIGHTED).mean()) if weights else 0.0
-
-
-def _rival(
-    problem: Problem,
-    best: Solution,
-    marginals: Marginals,
-    others: Sequence[Solution],
-    chain: Chain,
-) -> tuple[str | None, FloatArray | None, float | None]:
-    """Another track of a segment that fits as well and that the covariance does not cover.
-
-    Returns what to say of it, its positions at all nodes, and how much dearer the next best track
-    elsewhere is, whether or not it fits as well.
-    """
-    runner_up: float | None = None
-    sigma = np.sqrt(np.linalg.eigvalsh(marginals.of("position")[chain.nodes])[:, -1])
-    covered = max(1.0, COVERED_SIGMAS * float(np.sqrt(np.mean(sigma**2))))
-    for other in others:
-        here, there = (problem.layout.positions(s.x)[chain.nodes] for s in (best, other))
-        gap = here - there
-        apart = float(np.sqrt(np.mean(np.sum(gap**2, axis=1))))
-        extra = max(other.cost - best.cost, 0.0)
-        if apart <= covered:
-            continue
-        runner_up = extra if runner_up is None else runner_up
-        if extra < AMBIGUOUS_COST:
-            along = direction(np.linalg.eigh(gap.T @ gap)[1][:, -1])
-            text = (
-                f"ambiguous: another track, {apart:.0f} m away (rms, mostly {along}), fits as well "
-                f"(its cost is {extra:.2g} higher); a start, a fix, a turn or a second beacon off "
-                "the line would tell"
-            )
-            return text, problem.layout.positions(other.x), runner_up
-    return None, None, runner_up
-
-
 @dataclass
-class _Work:
-    """What one call of `smooth` gathers on its way."""
+class _Work(Work):
+    """What one call of `smooth` gathers on its way, with the mission as it stands."""
 
-    mission: Mission
-    progress: Progress | None
-    warnings: list[str] = field(default_factory=list[str])
-    wall_times: dict[str, float] = field(default_factory=dict[str, float])
-    _done: float = 0.0
-    _share: float = 1.0
-    _told: float = 0.0
-
-    def reset(self) -> None:
-        """Count progress from the beginning."""
-        self._told = 0.0
-
-    def begin(self, done: float, share: float) -> None:
-        self._done, self._share = done, share
-
-    def warn(self, segment: str, text: str) -> None:
-        self.warnings.append(f"{segment}: {text}" if segment else text)
-
-    @contextmanager
-    def stage(self, name: str) -> Generator[None]:
-        """Time a stage."""
-        self.tell(name, 0.0)
-        begin = perf_counter()
-        yield
-        self.wall_times[name] = self.wall_times.get(name, 0.0) + perf_counter() - begin
-
-    def tell(self, text: str, share: float) -> None:
-        # Never backwards: a stage that begins knows less of the whole than the one that ended.
-        self._told = max(self._told, self._done + self._share * share)
-        if self.progress is not None:
-            self.progress(text, self._told)
-
-    def solve(self, engine: Engine, x: FloatArray) -> Solution:
-        most = self.mission.options.max_iterations
-
-        def each(iteration: int, cost: float) -> None:
-            # Nobody knows how many iterations are left; a bar that nears its end serves.
-            self.tell(f"iteration {iteration}, cost {cost:.4g}", 1.0 - 0.85**iteration)
-
-        return solve(engine, x, most, each)
+    mission: Mission = field(kw_only=True)

@@ -39,7 +39,7 @@ from ubl_graph.errors import ConfigurationError
 from ubl_graph.workers import ProcessPool, SerialExecutor, executor_at, processors
 
 if TYPE_CHECKING:
-    from ubl_graph.smoother import Progress
+    from ubl_graph.work import Progress
 
 __all__ = [
     "CaseError",

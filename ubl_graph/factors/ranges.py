@@ -5,7 +5,7 @@ vehicle at receive time, a one-way one from the beacon to the vehicle at receive
 the acoustic time of one leg, g the logarithm of the sound-speed scale's effect and c the clock
 offset (one-way only),
 
-    residual = sum over legs of tau(antenna at its time, other end) exp(g at its time) + c - measured
+    residual = sum over legs of tau(here, there; at its time) exp(g at its time) + c - measured
 
 The other end is a beacon, known or not, a target, or another vehicle. The residual sees the
 positions of both ends and their derivatives alone; how a position is made of node states is the

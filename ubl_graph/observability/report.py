@@ -19,10 +19,11 @@ from ubl_graph.observability.directions import Rank, rank, reduced
 from ubl_graph.pose_trajectory import PoseTrajectory
 from ubl_graph.problem import Problem
 from ubl_graph.result import Result, SegmentResult
-from ubl_graph.smoother import AMBIGUOUS_COST, smooth
+from ubl_graph.smoother import smooth
 from ubl_graph.solve.choice import choose
 from ubl_graph.solve.rounds import solve
 from ubl_graph.track import Track, mirror_images, place, track_of, unanchored
+from ubl_graph.work import AMBIGUOUS_COST
 
 #: A second track nearer than so many metres is no second track.
 LEAST_SEPARATION = 1.0

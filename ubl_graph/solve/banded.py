@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import get_lapack_funcs
 
 from ubl_graph.arrays import FloatArray
-from ubl_graph.problem import Frozen, Problem
+from ubl_graph.problem import Frozen, LeastSquares
 from ubl_graph.solve.normal import NormalEquations, dot
 from ubl_graph.solve.rounds import (
     INITIAL_LAMBDA,
@@ -94,13 +94,13 @@ class BandedEngine:
 
     Parameters
     ----------
-    problem : Problem
+    problem : LeastSquares
         What to minimise.
     """
 
     name = "banded"
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: LeastSquares) -> None:
         self.problem = problem
         self._equations = NormalEquations(problem)
 

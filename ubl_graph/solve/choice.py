@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from ubl_graph.errors import SolverError
 from ubl_graph.factors.poses import PoseMotion
 from ubl_graph.options import Solver
-from ubl_graph.problem import Problem
+from ubl_graph.problem import LeastSquares
 from ubl_graph.solve.banded import BandedEngine
 from ubl_graph.solve.lm import GtsamEngine
 from ubl_graph.solve.normal import shape_of
@@ -44,12 +44,12 @@ class Choice:
     note: str = ""
 
 
-def choose(problem: Problem, solver: Solver) -> Choice:
+def choose(problem: LeastSquares, solver: Solver, most_shared: int = MOST_SHARED) -> Choice:
     """Engines for a problem.
 
     Parameters
     ----------
-    problem : Problem
+    problem : LeastSquares
         What is to be solved.
     solver : str
         The option. `auto` scouts on the fast path wherever that takes the problem, and has GTSAM
@@ -74,11 +74,11 @@ def choose(problem: Problem, solver: Solver) -> Choice:
         )
     if solver == "gtsam":
         return _alone(GtsamEngine(problem))
-    if shape.border > MOST_SHARED:
+    if shape.border > most_shared:
         return _alone(
             GtsamEngine(problem),
             f"GTSAM solves it, not the banded solver: {shape.border} unknowns are shared by all "
-            f"nodes, more than {MOST_SHARED}",
+            f"nodes, more than {most_shared}",
         )
     banded = BandedEngine(problem)
     few = problem.layout.node_count <= GTSAM_NODES and _pose_rows(problem) <= GTSAM_POSE_ROWS
@@ -87,7 +87,7 @@ def choose(problem: Problem, solver: Solver) -> Choice:
     return _alone(banded)
 
 
-def _pose_rows(problem: Problem) -> int:
+def _pose_rows(problem: LeastSquares) -> int:
     """Rows of poses that GTSAM asks Python for."""
     if problem.layout.node == "point":
         return 0

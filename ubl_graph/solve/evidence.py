@@ -24,7 +24,7 @@ import numpy as np
 from ubl_graph.arrays import BoolArray, FloatArray
 from ubl_graph.errors import SolverError
 from ubl_graph.factors.loss import RobustLoss
-from ubl_graph.problem import Frozen, Problem
+from ubl_graph.problem import Frozen, LeastSquares, Problem
 from ubl_graph.solve.banded import BandedDescent, BandedFactor
 from ubl_graph.solve.normal import NormalEquations, Point
 
@@ -101,7 +101,7 @@ def _normal(equations: NormalEquations) -> NormalEquations:
     return made
 
 
-def _without_outliers(problem: Problem, x: FloatArray, frozen: Frozen) -> tuple[Frozen, float]:
+def _without_outliers(problem: LeastSquares, x: FloatArray, frozen: Frozen) -> tuple[Frozen, float]:
     """Standard deviations that outliers have no part in, and the log likelihood of those.
 
     The latter makes up for what their widened density would count.

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt by GTSAM over a Problem's factor graph."""
+"""Levenberg-Marquardt by GTSAM over a LeastSquares's factor graph."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from scipy import sparse
 from ubl_graph.arrays import FloatArray
 from ubl_graph.errors import SolverError
 from ubl_graph.gtsam_view import GraphView
-from ubl_graph.problem import Frozen, Problem
+from ubl_graph.problem import Frozen, LeastSquares
 from ubl_graph.solve.rounds import (
     INITIAL_LAMBDA,
     LAMBDA_FACTOR,
@@ -23,13 +23,13 @@ class GtsamEngine:
 
     Parameters
     ----------
-    problem : Problem
+    problem : LeastSquares
         What to minimise.
     """
 
     name = "gtsam"
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: LeastSquares) -> None:
         self.problem = problem
         self._view = GraphView(problem)
 

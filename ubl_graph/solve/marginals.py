@@ -27,6 +27,7 @@ import numpy as np
 
 from ubl_graph.arrays import BoolArray, FloatArray, IntArray
 from ubl_graph.errors import SolverError
+from ubl_graph.layout import Layout
 from ubl_graph.problem import Problem
 from ubl_graph.solve.banded import BandedFactor
 from ubl_graph.solve.normal import NormalEquations, Point
@@ -45,42 +46,38 @@ MOST_COMPOSED = 64
 AT_ONCE = 4096
 
 
-class Marginals:
-    """Covariances of the unknowns at a solution.
+class Covariances:
+    """Covariances of the unknowns of a layout: of each node, and of each node with the next.
 
     Parameters
     ----------
-    problem : Problem
-        What was solved.
-    solution : Solution
-        Where it ended.
-
-    Attributes
-    ----------
+    layout : Layout
+        Whose unknowns.
+    node : array, shape (N, W, W)
+        Of each node's columns, scaled.
+    following : array, shape (N - 1, W, W)
+        Of each node's columns (rows) with the next one's, scaled.
+    shared : array, shape (S, S)
+        Of what all nodes share, scaled.
+    scale : array, shape (size,)
+        What a scaled column is to be multiplied by.
     unresolved : array of bool, shape (N,)
         Nodes whose position varies so much more than their neighbours hold them that double
         precision does not tell how much: the data do not determine it.
-
-    Raises
-    ------
-    SolverError
-        Where the normal equations are not finite or an unknown enters no residual.
     """
 
-    def __init__(self, problem: Problem, solution: Solution) -> None:
-        self._layout = layout = problem.layout
-        equations = NormalEquations(problem)
-        point = equations.evaluate(solution.x, solution.frozen)
-        found = _invert(equations, point, RIDGES)
-        self._scale, self._shared = found.scale, found.shared
-        self._node, self._following = found.node, found.following
-        self.unresolved: BoolArray = np.zeros(layout.node_count, dtype=np.bool_)
-        if found.doubtful:
-            # What a larger ridge lowers, the ridge has made, or rounding has.
-            own = layout.node_columns("position", np.zeros(1, dtype=np.int64))[0]
-            ridge = max(10.0 * found.ridge, DOUBTFUL_PIVOT)
-            larger = _invert(equations, point, [ridge]).node[:, own, own].sum(axis=1)
-            self.unresolved = larger < 0.5 * found.node[:, own, own].sum(axis=1)
+    def __init__(
+        self,
+        layout: Layout,
+        node: FloatArray,
+        following: FloatArray,
+        shared: FloatArray,
+        scale: FloatArray,
+        unresolved: BoolArray,
+    ) -> None:
+        self._layout = layout
+        self._node, self._following, self._shared = node, following, shared
+        self._scale, self.unresolved = scale, unresolved
 
     def of(self, name: str) -> FloatArray:
         """Covariance of a quantity, SI: (N, size, size) per node, (size, size) if shared."""
@@ -118,6 +115,37 @@ class Marginals:
         return columns[0], self._scale[columns] * units
 
 
+class Marginals(Covariances):
+    """Covariances of the unknowns at a solution.
+
+    Parameters
+    ----------
+    problem : Problem
+        What was solved.
+    solution : Solution
+        Where it ended.
+
+    Raises
+    ------
+    SolverError
+        Where the normal equations are not finite or an unknown enters no residual.
+    """
+
+    def __init__(self, problem: Problem, solution: Solution) -> None:
+        layout = problem.layout
+        equations = NormalEquations(problem)
+        point = equations.evaluate(solution.x, solution.frozen)
+        found = _invert(equations, point, RIDGES)
+        unresolved: BoolArray = np.zeros(layout.node_count, dtype=np.bool_)
+        if found.doubtful:
+            # What a larger ridge lowers, the ridge has made, or rounding has.
+            own = layout.node_columns("position", np.zeros(1, dtype=np.int64))[0]
+            ridge = max(10.0 * found.ridge, DOUBTFUL_PIVOT)
+            larger = _invert(equations, point, [ridge]).node[:, own, own].sum(axis=1)
+            unresolved = larger < 0.5 * found.node[:, own, own].sum(axis=1)
+        super().__init__(layout, found.node, found.following, found.shared, found.scale, unresolved)
+
+
 @dataclass(frozen=True, eq=False)
 class _Inverse:
     """Blocks of the scaled inverse, and how far to trust them."""
@@ -132,7 +160,7 @@ class _Inverse:
 
 def _invert(equations: NormalEquations, point: Point, ridges: Sequence[float]) -> _Inverse:
     """Invert with the first ridge that lets the factorisation pass."""
-    factor, scale, ridge = _scaled_factor(equations, point, ridges)
+    factor, scale, ridge = scaled_factor(equations, point, ridges)
     width = equations.problem.layout.node_width
     node, following = selected_inverse(factor.band, width)
     shared = np.empty((0, 0))
@@ -149,7 +177,7 @@ def _invert(equations: NormalEquations, point: Point, ridges: Sequence[float]) -
     return _Inverse(node, following, shared, scale, ridge, doubtful)
 
 
-def _scaled_factor(
+def scaled_factor(
     equations: NormalEquations, point: Point, ridges: Sequence[float]
 ) -> tuple[BandedFactor, FloatArray, float]:
     """Factor of the normal matrix scaled to unit diagonal, the columns' scale, and the ridge."""

@@ -22,7 +22,7 @@ from scipy import sparse
 
 from ubl_graph.arrays import FloatArray, IntArray
 from ubl_graph.factors.block import Block
-from ubl_graph.problem import Frozen, Problem
+from ubl_graph.problem import Frozen, LeastSquares
 
 #: Products that are formed at a time: enough to keep numpy busy, small enough for the cache.
 CHUNK = 1 << 16
@@ -79,10 +79,10 @@ class Shape:
         return band, coupling, corner
 
 
-def shape_of(problem: Problem) -> Shape:
+def shape_of(problem: LeastSquares) -> Shape:
     """Sizes that a problem's rows ask for."""
     layout = problem.layout
-    inner = layout.node_count * layout.node_width
+    inner = layout.inner
     reach = 1
     for block in problem.blocks:
         # Columns first: numpy runs along the rows then.
@@ -124,11 +124,11 @@ class NormalEquations:
 
     Parameters
     ----------
-    problem : Problem
+    problem : LeastSquares
         Whose equations.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: LeastSquares) -> None:
         self.problem = problem
         self.shape = shape_of(problem)
         zero = np.zeros(problem.layout.size)

@@ -14,7 +14,7 @@ import numpy as np
 
 from ubl_graph.arrays import FloatArray
 from ubl_graph.errors import SolverError
-from ubl_graph.problem import Frozen, Problem
+from ubl_graph.problem import Frozen, LeastSquares
 
 INITIAL_LAMBDA, LAMBDA_FACTOR, LARGEST_LAMBDA = 1e-3, 10.0, 1e10
 #: A step is taken where it lowers the cost by more than this share of what was predicted.
@@ -79,7 +79,7 @@ class Engine(Protocol):
         ...
 
     @property
-    def problem(self) -> Problem:
+    def problem(self) -> LeastSquares:
         """What it minimises."""
         ...
 
