@@ -53,6 +53,7 @@ ORDER = [
     "tuning",
     "result",
     "pose_assembly",
+    "odometry_fill",
     "assembly",
     "work",
     "smoother",

@@ -21,7 +21,7 @@ from ubl_graph.arrays import BoolArray, FloatArray, IntArray
 from ubl_graph.measurements import Odometry
 from ubl_graph.measurements.motion import SHORTEST_STEP
 from ubl_graph.nodes import SAME_INSTANT
-from ubl_graph.odometry_noise import in_space, odometry_covariances
+from ubl_graph.odometry_noise import PLANAR, in_space, odometry_covariances
 from ubl_graph.options import Options
 
 #: Ends nearer to each other than this are the same, s.
@@ -133,6 +133,27 @@ def compounded(
     first = np.flatnonzero(opens)
     last = np.append(first[1:], len(opens)) - 1
     return _records(t_from[first], t_to[last], _composed(pieces, np.cumsum(opens) - 1))
+
+
+def steps_of(records: Odometry, *, planar: bool) -> Steps:
+    """Records that have covariances as changes of pose.
+
+    Parameters
+    ----------
+    records : Odometry
+        Of `compounded`.
+    planar : bool
+        Whether to leave out what leads out of the plane.
+    """
+    covariance = records.covariances_flu
+    assert covariance is not None
+    if planar:
+        if covariance.shape[1] == 6:
+            covariance = covariance[:, PLANAR[:, None], PLANAR[None, :]]
+        return Steps(records.rotation_vector[:, 2], records.translation[:, :2], covariance)
+    if covariance.shape[1] == 3:
+        covariance = in_space(covariance)
+    return Steps(lie.rotation(records.rotation_vector), records.translation, covariance)
 
 
 def _joins(begin: FloatArray, end: FloatArray) -> BoolArray:

@@ -85,7 +85,7 @@ def trajectory_of(
         options.angular_acceleration_psd,
         layout.node == "pose2",
     )
-    return _with_differences(trajectory) if layout.still else trajectory
+    return with_differences(trajectory) if layout.still else trajectory
 
 
 def motion_slopes(layout: Layout, nodes: Poses) -> FloatArray:
@@ -105,7 +105,7 @@ def world_slopes(nodes: Poses) -> FloatArray:
     return out
 
 
-def _with_differences(trajectory: PoseTrajectory) -> PoseTrajectory:
+def with_differences(trajectory: PoseTrajectory) -> PoseTrajectory:
     """Velocities of nodes that have none: those of the constant twist to the next node."""
     assert trajectory.joint is not None
     # The cross covariance of such velocities with their neighbours' is not looked at.

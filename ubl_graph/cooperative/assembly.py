@@ -19,11 +19,13 @@ from ubl_graph.assembly import (
 )
 from ubl_graph.cooperative.fleet import Fleet, Target
 from ubl_graph.cooperative.marginals import FleetMarginals
-from ubl_graph.cooperative.model import FleetProblem
+from ubl_graph.cooperative.model import FleetProblem, MemberModel
 from ubl_graph.cooperative.result import FleetResiduals, TargetEstimate
 from ubl_graph.factors.ranges import RangeBlock
 from ubl_graph.nodes import NOMINAL_SPEED
-from ubl_graph.result import Result, Status
+from ubl_graph.odometry_fill import filled_in
+from ubl_graph.pose_trajectory import PoseTrajectory
+from ubl_graph.result import Result, SegmentResult, Shared, Status
 from ubl_graph.solve.rounds import Solution
 from ubl_graph.work import AMBIGUOUS_COST, COVERED_SIGMAS, rival_of
 
@@ -35,6 +37,7 @@ ADRIFT = (
 
 
 def assemble_member(
+    fleet: Fleet,
     problem: FleetProblem,
     solution: Solution,
     marginals: FleetMarginals,
@@ -49,6 +52,8 @@ def assemble_member(
 
     Parameters
     ----------
+    fleet : Fleet
+        Of which the vehicle is one.
     problem, solution, marginals
         Solved, with covariances.
     rivals : sequence of Solution
@@ -91,7 +96,25 @@ def assemble_member(
     segment = replace(segment, chi_square=chi_square, degrees_of_freedom=dof)
     shared = shared_of(own, mine, covariances)
     states = {name: s for name, s in shared.items() if not name.startswith("beacon ")}
-    return Result(member.mission, (segment,), beacons_of(member.mission, shared), states)
+    segment = _filled_in(member, segment, states)
+    mission = fleet.mission_of(member.name)
+    return Result(mission, (segment,), beacons_of(mission, shared), states)
+
+
+def _filled_in(
+    member: MemberModel, segment: SegmentResult, states: dict[str, Shared]
+) -> SegmentResult:
+    """A vehicle's result with a node at each record of odometry that was compounded."""
+    records, track = member.member.segment.odometry, segment.trajectory
+    if not isinstance(track, PoseTrajectory) or not track.still or records is None:
+        return segment
+    errors = {name: float(s.value[0]) for name, s in states.items()}
+    options = member.member.options
+    whole = filled_in(track, records, options, errors)
+    rival = segment.rival
+    if rival is not None:
+        rival = np.stack([np.interp(whole.t, track.t, c) for c in rival.T], axis=1)
+    return replace(segment, trajectory=whole, rival=rival)
 
 
 def _limit(problem: FleetProblem, name: str) -> float | None:

@@ -42,7 +42,7 @@ class MemberModel:
     member : Member
         The vehicle.
     mission : Mission
-        Its own, without ranges to vehicles and targets.
+        Its own, without ranges to vehicles and targets; compounded odometry brings its noise along.
     model : SegmentModel
         Nodes that stand at all its ranges, whoever measured them.
     layout : Layout
@@ -106,6 +106,8 @@ def model_member(fleet: Fleet, member: Member, pings: Sequence[PeerPings]) -> Me
         segment, view = (replace(s, odometry=steps) for s in (segment, view))
     model = replace(model_segment(view, options), segment=segment)
     mission = fleet.mission_of(member.name)
+    if segment.odometry is not None and segment.odometry is not member.segment.odometry:
+        mission = replace(mission, options=replace(options, odometry_noise="given"))
     clocked = any(
         p.kind == "one_way_range" and ((p.vehicle == member.name) | (p.peer == member.name)).any()
         for p in pings

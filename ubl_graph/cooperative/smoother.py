@@ -155,7 +155,7 @@ def _smooth_group(work: Work, fleet: Fleet, number: int) -> _Part:
         anchored = _anchored(fleet)
         vehicles = {
             member.name: assemble_member(
-                problem, best, marginals, rivals, i, number, solver, anchored=anchored
+                fleet, problem, best, marginals, rivals, i, number, solver, anchored=anchored
             )
             for i, member in enumerate(members)
         }

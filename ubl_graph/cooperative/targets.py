@@ -100,6 +100,7 @@ def _seen(
 ) -> _Seen:
     epoch = reference_time(target, pings) if target.moves else 0.0
     speed = float(np.mean(fleet.sound_speed.speed))
+    clocks = {v.name: v.options.clock_offset_sigma for v in fleet.vehicles}
     columns: list[tuple[FloatArray, ...]] = [(np.empty((0, 3)), *[np.empty(0)] * 3)]
     for p in pings:
         rows = np.flatnonzero(p.peer == target.name)
@@ -110,7 +111,11 @@ def _seen(
             own = p.vehicle[rows] == name
             t, position = ways[str(name)]
             place[own] = np.stack([np.interp(at[own], t, c) for c in position.T], axis=1)
-        columns.append((place, metres * p.measured[rows], metres * p.sigma[rows], at - epoch))
+        sigma = p.sigma[rows]
+        if p.kind == "one_way_range":
+            # A range between clocks that may differ says as little as they do.
+            sigma = np.hypot(sigma, [clocks[str(name)] for name in p.vehicle[rows]])
+        columns.append((place, metres * p.measured[rows], metres * sigma, at - epoch))
     return _Seen(*(np.concatenate(parts) for parts in zip(*columns, strict=True)))
 
 
