@@ -109,6 +109,38 @@ def find_pose_tracks(mission: Mission, model: SegmentModel) -> Starts:
     return Starts(tuple(tracks), None, runner_up)
 
 
+def reckoned_track(mission: Mission, model: SegmentModel) -> Track | None:
+    """Where odometry leads from a start whose place and heading are known.
+
+    Parameters
+    ----------
+    mission, model
+        As for `find_pose_tracks`.
+
+    Returns
+    -------
+    Track or None
+        None where the start does not say enough, or there is no odometry.
+    """
+    start = model.segment.start
+    if mission.options.node == "point" or start is None or start.heading is None:
+        return None
+    placed = start.up is not None or mission.options.node == "pose2"
+    if not placed or start.heading_sigma > TRUSTED_HEADING or len(model.t) < 2:
+        return None
+    reckoned = _reckoned(mission, model)
+    if reckoned is None:
+        return None
+    then = np.array([start.t])
+    rotation, position = _onto(then, model.t, reckoned.rotation, reckoned.position)
+    turn = 0.5 * np.pi - start.heading - float(_yaw(rotation)[0])
+    turned = lie.rotation(turn * np.array([[0.0, 0.0, 1.0]]))[0]
+    place = np.array([start.east, start.north, start.up or 0.0])
+    way = (reckoned.position - position[0]) @ turned.T + place
+    yaw = np.unwrap(_yaw(reckoned.rotation)) + turn
+    return _track(model, reckoned, PoseStart(way, yaw, 0.0, 0.0, 0.0, 0.0))
+
+
 def find_tracks(mission: Mission, model: SegmentModel) -> Starts:
     """Search a segment's start, whatever its nodes are: `find_starts` or `find_pose_tracks`."""
     find = find_starts if mission.options.node == "point" else find_pose_tracks

@@ -24,7 +24,7 @@ from ubl_graph.initial import Starts
 from ubl_graph.measurements import SlantRange
 from ubl_graph.mission import Start
 from ubl_graph.nodes import NOMINAL_SPEED
-from ubl_graph.pose_initial import find_tracks
+from ubl_graph.pose_initial import find_tracks, reckoned_track
 
 #: Ranges to others that a search looks at; more are thinned out evenly.
 MOST_RANGES = 200
@@ -120,6 +120,9 @@ def _known_ranges(
 def _searched(member: MemberModel, ranges: list[tuple[float, FloatArray, float, float]]) -> Starts:
     """Search one vehicle's start among beacons and the known places of others."""
     model, mission = member.model, member.mission
+    reckoned = reckoned_track(mission, model)
+    if reckoned is not None:
+        return Starts((reckoned,), None)
     segment = model.segment
     if ranges:
         some = np.unique(np.linspace(0, len(ranges) - 1, MOST_RANGES).astype(int))
