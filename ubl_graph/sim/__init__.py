@@ -39,15 +39,20 @@ from ubl_graph.sim.tracks import (
     wander,
 )
 from ubl_graph.sim.xue2024 import munk_profile, xue_pass, xue_track, xue_wandering
+from ubl_graph.sim.zhao import ZhaoRuns, ZhaoSettings, map_grid, zhao_map, zhao_runs, zhao_track
+from ubl_graph.sim.zhao_fleet import ZHAO_OPTIONS, zhao_fleet
 
 __all__ = [
     "DRIFTING",
     "PLANAR",
+    "ZHAO_OPTIONS",
     "Clock",
     "DvlErrors",
     "Sea",
     "SeaTrial",
     "Truth",
+    "ZhaoRuns",
+    "ZhaoSettings",
     "ahrs",
     "cao_pass",
     "cao_sea_trial",
@@ -60,6 +65,7 @@ __all__ = [
     "fixes",
     "gyro",
     "lawn_mower",
+    "map_grid",
     "munk_profile",
     "odometer",
     "one_way_pings",
@@ -73,4 +79,8 @@ __all__ = [
     "xue_pass",
     "xue_track",
     "xue_wandering",
+    "zhao_fleet",
+    "zhao_map",
+    "zhao_runs",
+    "zhao_track",
 ]
