@@ -411,3 +411,15 @@ def test_the_scale_of_slant_ranges_is_drawn_as_their_own():
     state = result.segments[0].slow["sound_speed"]
     drawn = axes.lines[0].get_ydata()
     np.testing.assert_allclose(drawn, 100.0 * (np.exp(state.value[:, 0]) - 1.0))
+
+
+def test_ellipses_that_would_hide_the_map_are_left_out(result):
+    def ellipses(covariance: np.ndarray) -> int:
+        track_of = result.segments[0].trajectory
+        whole = np.broadcast_to(covariance, track_of.covariance.shape)
+        segment = replace(result.segments[0], trajectory=replace(track_of, covariance=whole))
+        return len(track(replace(result, segments=(segment,))).get_axes()[0].patches)
+
+    # A known point, a direction that is open, and nothing known at all.
+    assert ellipses(np.diag([1.0, 1.0, 1.0])) == ellipses(np.diag([1e10, 1.0, 1.0])) == 25
+    assert ellipses(np.diag([1e10, 1e10, 1.0])) == 0

@@ -16,6 +16,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ubl_graph.acoustics import SoundSpeedProfile
     from ubl_graph.beacon import Beacon
+    from ubl_graph.cooperative.fleet import Fleet, Member, Target
+    from ubl_graph.cooperative.result import FleetResult
+    from ubl_graph.cooperative.smoother import smooth_fleet
     from ubl_graph.errors import (
         ConfigurationError,
         DataError,
@@ -27,6 +30,7 @@ if TYPE_CHECKING:
     )
     from ubl_graph.evaluation import Errors, evaluate
     from ubl_graph.frames import GeodeticOrigin, LeverArm
+    from ubl_graph.io.fleet_file import load_fleet
     from ubl_graph.io.mission_file import load_mission, load_setup
     from ubl_graph.measurements import (
         AngularRate,
@@ -42,6 +46,7 @@ if TYPE_CHECKING:
     )
     from ubl_graph.mission import Mission, Reference, Segment, Setup, Start, Vehicle
     from ubl_graph.online.estimator import FixedLagEstimator
+    from ubl_graph.online.fleet_estimator import FleetEstimator
     from ubl_graph.online.outputs import Estimate, Event, Outcome
     from ubl_graph.options import Options
     from ubl_graph.result import Result
@@ -52,6 +57,11 @@ __version__ = "0.1.0"
 
 _HOME = {
     "SoundSpeedProfile": "acoustics",
+    "Fleet": "cooperative.fleet",
+    "FleetResult": "cooperative.result",
+    "Member": "cooperative.fleet",
+    "Target": "cooperative.fleet",
+    "smooth_fleet": "cooperative.smoother",
     "ConfigurationError": "errors",
     "DataError": "errors",
     "NoDirectRayError": "errors",
@@ -66,7 +76,9 @@ _HOME = {
     "Estimate": "online.outputs",
     "Event": "online.outputs",
     "FixedLagEstimator": "online.estimator",
+    "FleetEstimator": "online.fleet_estimator",
     "Outcome": "online.outputs",
+    "load_fleet": "io.fleet_file",
     "load_mission": "io.mission_file",
     "load_setup": "io.mission_file",
     "AngularRate": "measurements",
@@ -108,9 +120,13 @@ __all__ = [  # noqa: RUF022 - by subject, as in `_HOME`
     "Estimate",
     "Event",
     "FixedLagEstimator",
+    "Fleet",
+    "FleetEstimator",
+    "FleetResult",
     "GeodeticOrigin",
     "Heading",
     "LeverArm",
+    "Member",
     "Mission",
     "Odometry",
     "OneWayRange",
@@ -124,15 +140,18 @@ __all__ = [  # noqa: RUF022 - by subject, as in `_HOME`
     "SlantRange",
     "SoundSpeedProfile",
     "Start",
+    "Target",
     "Trajectory",
     "TwoWayRange",
     "Vehicle",
     "Velocity",
     "__version__",
     "evaluate",
+    "load_fleet",
     "load_mission",
     "load_setup",
     "smooth",
+    "smooth_fleet",
 ]
 
 

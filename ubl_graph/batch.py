@@ -25,7 +25,8 @@ from ubl_graph import errors
 from ubl_graph.errors import ConfigurationError, DataError, UblGraphError
 from ubl_graph.evaluation import Errors, evaluate
 from ubl_graph.io.mission_file import load_mission
-from ubl_graph.io.result_files import check_folder, versions, write_result
+from ubl_graph.io.output_folder import check_folder
+from ubl_graph.io.result_files import versions, write_result
 from ubl_graph.mission import Mission
 from ubl_graph.options import Options
 from ubl_graph.smoother import smooth
@@ -34,7 +35,7 @@ from ubl_graph.workers import ProcessPool, SerialExecutor
 
 if TYPE_CHECKING:
     from ubl_graph.result import Result
-    from ubl_graph.smoother import Progress
+    from ubl_graph.work import Progress
 
 #: Files of the whole batch, beside the missions' folders.
 TABLES: tuple[str, ...] = ("batch.csv", "batch.json")

@@ -6,11 +6,10 @@ Bad input ends with one line on standard error and exit code 2; nothing is writt
 from __future__ import annotations
 
 import logging
-import math
 import os
 import sys
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Generator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -19,17 +18,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
+from ubl_graph.cli_tables import (
+    batch_table,
+    errors_table,
+    segments_table,
+    targets_table,
+    vehicles_table,
+)
 from ubl_graph.errors import UblGraphError
 
 if TYPE_CHECKING:
-    from ubl_graph.arrays import FloatArray
-    from ubl_graph.batch import BatchRow
+    from ubl_graph.cooperative.result import FleetResult
     from ubl_graph.evaluation import Errors
     from ubl_graph.mission import Mission
     from ubl_graph.result import Result
-    from ubl_graph.smoother import Progress as Report
+    from ubl_graph.work import Progress as Report
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -73,19 +77,26 @@ def smooth(
 ) -> None:
     """Smooth a mission and write trajectory, residuals, result and figures.
 
+    A file with [[vehicle]] tables is a fleet's: all its vehicles are smoothed together, and each
+    gets a folder in DIR.
+
     Example: ubl-graph smooth dive.toml -o dive-out
     """
     from ubl_graph.evaluation import Errors, evaluate
     from ubl_graph.io.mission_file import load_mission
+    from ubl_graph.io.mission_parts import holds_fleet
 
+    if holds_fleet(mission):
+        _smooth_fleet(mission, output, figures, solver)
+        return
     loaded = _solved_by(load_mission(mission), solver)
     _check_output(output)
     result = _smooth(loaded)
     _write(result, output, figures)
-    _print_segments(result)
+    _print_result(result)
     compared = evaluate(result)
     if compared:
-        _print_errors({"against the reference": Errors.joined(compared.values())})
+        _show(errors_table({"against the reference": Errors.joined(compared.values())}))
 
 
 @app.command()
@@ -108,13 +119,13 @@ def demo(
     result = _smooth(mission)
     reckoned = dead_reckoning(mission)
     _write(result, output, figures, {"dead reckoning": list(reckoned.values())})
-    _print_segments(result)
+    _print_result(result)
     rows: dict[str, Errors] = {}
     for segment in mission.segments:
         assert segment.reference is not None
         rows["dead reckoning"] = errors_of(reckoned[segment.name], segment.reference)
         rows["smoothed"] = evaluate(result)[segment.name]
-    _print_errors(rows)
+    _show(errors_table(rows))
 
 
 @app.command()
@@ -163,7 +174,10 @@ def batch(
             typer.echo(f"warning: {row.folder}: {warning}", err=True)
     write_table(rows, output)
     typer.echo(f"written to {output}")
-    _print_batch(rows)
+    _show(batch_table(rows))
+    for row in rows:
+        if row.reason:
+            typer.echo(f"{row.folder}: {row.status}: {row.reason}")
     if any(row.failed for row in rows):
         raise typer.Exit(1)
 
@@ -249,6 +263,25 @@ def _smooth(mission: Mission) -> Result:
         return run(mission, report)
 
 
+def _smooth_fleet(file: Path, output: Path, figures: bool, solver: str | None) -> None:
+    from ubl_graph.cooperative.smoother import smooth_fleet
+    from ubl_graph.io.fleet_file import load_fleet
+    from ubl_graph.io.fleet_result_files import write_fleet_result
+
+    fleet = load_fleet(file)
+    if solver is not None:
+        fleet = replace(fleet, options=replace(fleet.options, solver=solver))
+    _check_output(output)
+    with _progress(fleet.name) as report:
+        result = smooth_fleet(fleet, report)
+    write_fleet_result(result, output, figures)
+    typer.echo(f"written to {output}")
+    _print_status(result)
+    _show(vehicles_table(result))
+    if result.targets:
+        _show(targets_table(result))
+
+
 def _write(result: Result, folder: Path, figures: bool, beside: Any = None) -> None:
     from ubl_graph.io.result_files import write_result
 
@@ -257,7 +290,7 @@ def _write(result: Result, folder: Path, figures: bool, beside: Any = None) -> N
 
 
 def _check_output(folder: Path) -> None:
-    from ubl_graph.io.result_files import check_folder
+    from ubl_graph.io.output_folder import check_folder
 
     check_folder(folder)
 
@@ -288,90 +321,21 @@ def _progress(name: str) -> Generator[Report]:
             bar.stop()
 
 
-def _print_segments(result: Result) -> None:
-    typer.echo(f"status: {result.status}" + (f" ({result.reason})" if result.reason else ""))
+def _print_result(result: Result) -> None:
+    _print_status(result)
     if result.tuning is not None and result.tuning.chosen:
         typer.echo("chosen by the data: " + ", ".join(_chosen(result.tuning.chosen)))
+    _show(segments_table(result))
+
+
+def _print_status(result: Result | FleetResult) -> None:
+    typer.echo(f"status: {result.status}" + (f" ({result.reason})" if result.reason else ""))
     for warning in result.warnings:
         typer.echo(f"warning: {warning}", err=True)
-    from ubl_graph.pose_trajectory import PoseTrajectory
-
-    poses = any(isinstance(s.trajectory, PoseTrajectory) for s in result.segments)
-    further = ("heading sd, deg", "next best, cost") if poses else ()
-    table = _table(
-        *("segment", "nodes", "pings", "down-weighted", "median sd, m"), *further, "status"
-    )
-    for segment in result.segments:
-        track = segment.trajectory
-        sd = track.covariance[:, [0, 1], [0, 1]].max(axis=1) ** 0.5
-        residuals = segment.residuals
-        row = [
-            segment.name or "-",
-            str(len(track.t)),
-            "0" if residuals is None else str(len(residuals)),
-            "0" if residuals is None else str(int(residuals.down_weighted.sum())),
-            f"{_middle(sd):.2f}",
-        ]
-        if isinstance(track, PoseTrajectory):
-            row.append(f"{_middle(track.attitude_sigma[:, 0]) * 180.0 / math.pi:.2f}")
-            row.append(_number(segment.runner_up, "+{:.3g}"))
-        table.add_row(*row, segment.status)
-    _show(table)
-
-
-def _middle(values: FloatArray) -> float:
-    return float(sorted(values)[len(values) // 2])
 
 
 def _chosen(values: dict[str, float | str]) -> list[str]:
     return [f"{k} {v if isinstance(v, str) else format(v, '.2g')}" for k, v in values.items()]
-
-
-def _print_batch(rows: Sequence[BatchRow]) -> None:
-    table = _table(
-        *("mission", "segments", "pings", "down-weighted"),
-        *("median sd, m", "rmse, m", "time, s", "status"),
-    )
-    for row in rows:
-        table.add_row(
-            row.folder,
-            "-" if row.failed else str(row.segments),
-            "-" if row.failed else str(row.pings),
-            _number(row.down_weighted_share, "{:.1%}"),
-            _number(row.median_sd_m, "{:.2f}"),
-            _number(row.horizontal_rmse_m, "{:.2f}"),
-            f"{row.seconds:.1f}",
-            row.status,
-        )
-    _show(table)
-    for row in rows:
-        if row.reason:
-            typer.echo(f"{row.folder}: {row.status}: {row.reason}")
-
-
-def _print_errors(rows: dict[str, Errors]) -> None:
-    table = _table("horizontal error", "rmse, m", "interior, m", "largest, m", "NEES (2 expected)")
-    for name, errors in rows.items():
-        found = errors.summary()
-        table.add_row(
-            name,
-            _number(found["horizontal_rmse_m"], "{:.2f}"),
-            _number(found["interior_horizontal_rmse_m"], "{:.2f}"),
-            f"{errors.horizontal.max():.2f}",
-            _number(found["interior_mean_nees_2dof"], "{:.1f}"),
-        )
-    _show(table)
-
-
-def _number(value: float | None, form: str) -> str:
-    return "-" if value is None else form.format(value)
-
-
-def _table(*columns: str) -> Table:
-    table = Table(box=None, pad_edge=False, header_style="")
-    for i, column in enumerate(columns):
-        table.add_column(column, justify="left" if i == 0 else "right", no_wrap=True)
-    return table
 
 
 def _show(table: Any) -> None:

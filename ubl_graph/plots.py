@@ -1,8 +1,4 @@
-"""One function a figure. Every function takes a Result and gives a matplotlib Figure.
-
-Colours are Okabe and Ito's, which colour-blind readers tell apart; line styles and marks differ
-too.
-"""
+"""One function a figure. Every function takes a Result and gives a matplotlib Figure."""
 
 from __future__ import annotations
 
@@ -13,19 +9,28 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse
 
-from ubl_graph.arrays import BoolArray, FloatArray
+from ubl_graph.arrays import FloatArray
 from ubl_graph.attitude import AttitudeTrack
+from ubl_graph.drawing import (
+    COLOURS,
+    GREY,
+    RED,
+    draw_beacons,
+    draw_ellipses,
+    draw_residuals,
+    ellipse_factor,
+    residual_limit,
+    residual_title,
+    typical_sigma,
+)
 from ubl_graph.evaluation import evaluate
 from ubl_graph.nodes import NOMINAL_SPEED
 from ubl_graph.pose_trajectory import PoseStates, PoseTrajectory, mariners_angles
-from ubl_graph.result import RangeResiduals, Result, SegmentResult
+from ubl_graph.result import Result, SegmentResult
 from ubl_graph.segment import Segment
 from ubl_graph.trajectory import Trajectory
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C6D1F")
-GREY, RED = "#7F7F7F", "#B2182B"
 #: Tracks by their name, to draw beside the smoothed one.
 Beside = Mapping[str, Sequence[Trajectory]]
 #: Axis label, factor from SI, per component of a slow state.
@@ -35,11 +40,8 @@ SLOW_LABELS = {
     "current": (("current east, m/s", 1.0), ("current north, m/s", 1.0)),
     "heading_bias": (("heading bias, degrees", 180.0 / np.pi),),
 }
-#: 95 % of a two-dimensional normal distribution lie within so many standard deviations.
-ELLIPSE_95 = 2.4477
-#: Residuals beyond so many times the largest that counts are drawn at the edge: one ping that is
-#: far off must not flatten all others.
-FAR = 6.0
+#: Ellipses along a segment's track.
+ELLIPSES = 25
 #: Readings of a compass that are drawn; more are thinned out evenly.
 MOST_READINGS = 500
 
@@ -72,7 +74,8 @@ def track(result: Result, beside: Beside | None = None) -> Figure:
     figure = Figure(figsize=(8.0, 7.0), layout="constrained")
     axes = figure.subplots()
     _draw_reference(axes, result)
-    enlarged = _ellipse_factor(result)
+    whole = result.trajectory
+    enlarged = ellipse_factor(whole.position, typical_sigma(whole.covariance))
     for i, segment in enumerate(result.segments):
         colour = COLOURS[i % len(COLOURS)]
         east, north = segment.trajectory.position[:, :2].T
@@ -80,12 +83,15 @@ def track(result: Result, beside: Beside | None = None) -> Figure:
         axes.plot(east, north, color=colour, lw=1.4, label=label, zorder=3)
         label = None if i else "start"
         axes.plot(east[0], north[0], "o", color=colour, mfc="white", label=label, zorder=3.5)
-        _draw_ellipses(axes, segment, enlarged, colour)
     for name, tracks in (beside or {}).items():
         for i, other in enumerate(tracks):
             label = None if i else name
             axes.plot(*other.position[:, :2].T, color=RED, lw=1.0, ls="-.", label=label, zorder=2)
-    _draw_beacons(axes, result)
+    draw_beacons(axes, result.beacons)
+    for i, segment in enumerate(result.segments):
+        nodes, colour = segment.trajectory, COLOURS[i % len(COLOURS)]
+        some = np.unique(np.linspace(0, len(nodes.t) - 1, ELLIPSES).astype(int))
+        draw_ellipses(axes, nodes.position[some], nodes.covariance[some], enlarged, colour)
     axes.set_xlabel("east, m")
     axes.set_ylabel("north, m")
     axes.set_aspect("equal", adjustable="datalim")
@@ -115,10 +121,10 @@ def residuals(result: Result) -> Figure:
     panels = figure.subplots(len(parts), 1, sharex=True, squeeze=False)[:, 0]
     for axes, (name, in_metres, mine) in zip(panels, parts, strict=True):
         factor = NOMINAL_SPEED if in_metres else 1e3
-        limit = factor * _residual_limit(table, slant == in_metres)
-        _draw_residuals(axes, table, mine, factor, limit)
+        limit = factor * residual_limit(table, slant == in_metres)
+        draw_residuals(axes, table, mine, factor, limit)
         unit, noun = ("m", "range") if in_metres else ("ms", "ping")
-        title = _residual_title(name, table, mine, factor, unit)
+        title = residual_title(name, table, mine, factor, unit)
         axes.set_title(title, fontsize=9, loc="left")
         axes.set_ylabel(f"model - {noun}, {unit}", fontsize=8)
     drawn = {line.get_label(): line for axes in panels for line in axes.lines}
@@ -248,43 +254,6 @@ def _time_label(result: Result) -> str:
     return "t, number of the pose" if counted else "time, s"
 
 
-def _residual_limit(table: RangeResiduals, these: BoolArray) -> float:
-    """Largest residual that is drawn in its place, s."""
-    size = np.abs(table.residual)
-    kept = size[these & ~table.down_weighted].max(initial=0.0)
-    largest = float(size[these].max())
-    return 1.1 * (min(largest, FAR * float(kept)) or largest or 1e-9)
-
-
-def _draw_residuals(
-    axes: Axes, table: RangeResiduals, mine: BoolArray, factor: float, limit: float
-) -> None:
-    """Residuals of one panel times `factor`, with the axis ending at `limit`."""
-    t, residual, out = table.t_transmit, factor * table.residual, table.down_weighted
-    far = mine & (np.abs(residual) > limit)
-    kept, doubted = mine & ~out & ~far, mine & out & ~far
-    axes.plot(t[kept], residual[kept], ".", color=COLOURS[0], ms=3, label="used")
-    axes.plot(t[doubted], residual[doubted], "x", color=RED, ms=6, label="down-weighted")
-    if far.any():
-        edge = 0.97 * limit * np.sign(residual[far])
-        axes.plot(t[far], edge, "D", color=RED, ms=5, mfc="none", label="beyond the axis")
-    axes.axhline(0.0, color=GREY, lw=0.8)
-    axes.set_ylim(-limit, limit)
-    axes.grid(alpha=0.3)
-
-
-def _residual_title(
-    name: str, table: RangeResiduals, mine: BoolArray, factor: float, unit: str
-) -> str:
-    out = table.down_weighted
-    kept = factor * table.residual[mine & ~out]
-    rms = float(np.sqrt(np.mean(kept**2))) if len(kept) else 0.0
-    return (
-        f"{name}: {int(mine.sum())} pings, {int((mine & out).sum())} down-weighted, "
-        f"rms of the others {rms:.3f} {unit}"
-    )
-
-
 def _readings(segment: Segment, nodes: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Times (s) and headings (rad) that a segment's references read, as the estimator saw them.
 
@@ -349,44 +318,6 @@ def _draw_reference(axes: Axes, result: Result) -> None:
             east, north = segment.reference.position[:, :2].T
             axes.plot(east, north, color="black", lw=0.9, ls="--", label=label, zorder=4)
             label = None
-
-
-def _draw_beacons(axes: Axes, result: Result) -> None:
-    for i, (name, beacon) in enumerate(result.beacons.items()):
-        east, north = beacon.value[:2]
-        axes.plot(east, north, "^", color="black", ms=8, label=None if i else "beacon", zorder=5)
-        text = axes.annotate(name, (east, north), xytext=(6, 6), textcoords="offset points")
-        text.set(fontsize=8, bbox={"fc": "white", "alpha": 0.7, "lw": 0, "pad": 1}, zorder=6)
-
-
-def _draw_ellipses(axes: Axes, segment: SegmentResult, factor: float, colour: str) -> None:
-    track = segment.trajectory
-    chosen = np.unique(np.linspace(0, len(track.t) - 1, 25).astype(int))
-    values, vectors = np.linalg.eigh(track.covariance[chosen][:, :2, :2])
-    widths = 2.0 * ELLIPSE_95 * factor * np.sqrt(np.maximum(values, 0.0))
-    for centre, width, axis in zip(track.position[chosen, :2], widths, vectors, strict=True):
-        angle = float(np.rad2deg(np.arctan2(axis[1, 1], axis[0, 1])))
-        place = (float(centre[0]), float(centre[1]))
-        # add_artist leaves the map's limits alone: one unsure end must not shrink all the rest.
-        axes.add_artist(
-            Ellipse(place, width[1], width[0], angle=angle, fc=colour, alpha=0.25, lw=0, zorder=2)
-        )
-
-
-def _ellipse_factor(result: Result) -> float:
-    """1, 2, 5, 10, 20, ...: how much ellipses are enlarged so that they can be seen on the map."""
-    position = result.trajectory.position[:, :2]
-    extent = max(float(np.ptp(position, axis=0).max()), 1.0)
-    semi = ELLIPSE_95 * np.sqrt(_typical_variance(result.trajectory.covariance))
-    wanted = 0.02 * extent / max(semi, 1e-9)
-    if wanted <= 1.0:
-        return 1.0
-    decade = 10.0 ** np.floor(np.log10(wanted))
-    return float(decade * max(step for step in (1.0, 2.0, 5.0) if step * decade <= wanted))
-
-
-def _typical_variance(covariance: FloatArray) -> float:
-    return float(np.median(np.linalg.eigvalsh(covariance[:, :2, :2])[:, 1]))
 
 
 def _mean_speed(result: Result) -> float:

@@ -66,6 +66,13 @@ LAYOUTS: dict[str, Layout] = {
 }
 
 
+#: What a file of the whole fleet calls the two ends of a range: who measured, and the other one.
+ENDS = ("vehicle", "peer")
+for _kind in ("two_way_range", "one_way_range", "slant_range"):
+    _columns = (*ENDS, *(name for name in LAYOUTS[_kind].required if name != "beacon"))
+    LAYOUTS[f"fleet_{_kind}"] = Layout(_columns, LAYOUTS[_kind].optional)
+
+
 def degrees(table: Table, name: str, low: float, high: float) -> FloatArray:
     """Return a column of angles in degrees, checked.
 

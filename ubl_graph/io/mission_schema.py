@@ -1,12 +1,13 @@
 """The keys of a mission file, and what to say where a document has others.
 
-Unknown keys are refused, and text never becomes a number. Only `mission_file` imports this module,
-so that only those who read mission files pay for pydantic.
+Unknown keys are refused, and text never becomes a number. Only modules that read mission files
+import this one, so that no other user pays for pydantic.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_type_hints
@@ -27,7 +28,8 @@ from ubl_graph.options import Options
 _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
-def _one_or_three(value: object) -> object:
+def one_or_three(value: object) -> object:
+    """Let a number or a list of three pass; for `BeforeValidator`."""
     numbers = value if isinstance(value, list) else [value]
     if len(numbers) not in (1, 3) or not all(type(n) in (int, float) for n in numbers):
         raise ValueError(f"{shortened(value)} is neither a number nor [east, north, up]")
@@ -71,7 +73,7 @@ class MissionTable(NamedTable):
 
 
 class PositionTable(Table):
-    """Three of these, metres or degrees; `mission_file` checks which."""
+    """Three of these, metres or degrees; `mission_parts` checks which."""
 
     east: float | None = None
     north: float | None = None
@@ -86,12 +88,12 @@ class BeaconTable(Table):
 
     name: str
     position: PositionTable
-    sigma: Annotated[Any, BeforeValidator(_one_or_three)] = 0.0
+    sigma: Annotated[Any, BeforeValidator(one_or_three)] = 0.0
     turnaround: float | None = None
 
 
 class SoundSpeedTable(Table):
-    """[sound_speed]: m/s or a file; `mission_file` checks that it is one of them."""
+    """[sound_speed]: m/s or a file; `mission_parts` checks that it is one of them."""
 
     constant: float | None = None
     profile: str | None = None
@@ -160,13 +162,16 @@ class PyfgDataTable(Table):
     file: str
 
 
-def _options_model() -> Any:
+def options_model(without: Sequence[str] = ()) -> Any:
+    """[options]: its keys are the fields of Options, which stand there alone, but for some."""
     kinds = get_type_hints(Options)
-    keys: dict[str, Any] = {f.name: (kinds[f.name], f.default) for f in fields(Options)}
+    keys: dict[str, Any] = {
+        f.name: (kinds[f.name], f.default) for f in fields(Options) if f.name not in without
+    }
     return create_model("_Options", __base__=Table, **keys)
 
 
-_Options = _options_model()
+OptionsTable = options_model()
 
 
 class CsvDocument(Table):
@@ -177,8 +182,7 @@ class CsvDocument(Table):
     sound_speed: SoundSpeedTable | None = None
     vehicle: VehicleTable = VehicleTable()
     start: StartTable | None = None
-    # The keys of [options] are the fields of Options, and stand there alone.
-    options: _Options = _Options()  # pyright: ignore[reportInvalidTypeForm]
+    options: OptionsTable = OptionsTable()  # pyright: ignore[reportInvalidTypeForm]
     data: CsvDataTable = CsvDataTable()
 
 
@@ -186,7 +190,7 @@ class GarposDocument(Table):
     """A mission file with data in a GARPOS campaign's files."""
 
     mission: NamedTable = NamedTable()
-    options: _Options = _Options()  # pyright: ignore[reportInvalidTypeForm]
+    options: OptionsTable = OptionsTable()  # pyright: ignore[reportInvalidTypeForm]
     data: GarposDataTable
 
 
@@ -196,7 +200,7 @@ class PyfgDocument(Table):
     mission: MissionTable = MissionTable()
     vehicle: VehicleTable = VehicleTable()
     start: StartTable | None = None
-    options: _Options = _Options()  # pyright: ignore[reportInvalidTypeForm]
+    options: OptionsTable = OptionsTable()  # pyright: ignore[reportInvalidTypeForm]
     data: PyfgDataTable
 
 
@@ -240,7 +244,7 @@ def validated(content: dict[str, Any], path: Path) -> Document:
     try:
         return _FORMATS[form].model_validate(content)
     except ValidationError as error:
-        raise _plain(error, content, form, path) from error
+        raise plain(error, content, path, lambda place: _unknown_key(place, form)) from error
 
 
 _WORDS = {
@@ -257,30 +261,55 @@ _WORDS = {
 }
 
 
-def _plain(
-    error: ValidationError, content: dict[str, Any], form: str, path: Path
+#: Where a complaint belongs in a document: keys of tables, numbers within lists of tables.
+Place = tuple[int | str, ...]
+
+
+def plain(
+    error: ValidationError,
+    content: dict[str, Any],
+    path: Path,
+    unknown: Callable[[Place], tuple[str, str]],
 ) -> ConfigurationError:
-    """Say the first of pydantic's complaints, unknown keys before all others, in plain words."""
+    """Say the first of pydantic's complaints, unknown keys before all others, in plain words.
+
+    Parameters
+    ----------
+    error : ValidationError
+        What pydantic said.
+    content : dict
+        The document.
+    path : Path
+        Its file.
+    unknown : callable
+        Problem and remedy where a key is unknown, by its place.
+
+    Returns
+    -------
+    ConfigurationError
+    """
     details = error.errors(include_url=False)
     # A misspelt key is often the reason why another is missing.
     detail = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
     kind, place, value = detail["type"], detail["loc"], detail["input"]
     remedy = ""
     words_allowed: list[str] = []
-    if place[:1] == ("options",):
+    if "options" in place:
         # Each kind that an option may have complains for itself, under a place of its own.
-        place = place[:2]
-        complaints = [d for d in details if d["loc"][:2] == place and d["type"] == "literal_error"]
-        words_allowed = [word for d in complaints for word in _literals(d)]
+        place = place[: place.index("options") + 2]
+        complaints = [d for d in details if d["loc"][: len(place)] == place]
+        allowing = [d for d in complaints if d["type"] == "literal_error"]
+        words_allowed = [word for d in allowing for word in _literals(d)]
     if kind == "extra_forbidden":
-        problem, remedy = _unknown_key(place, form)
+        problem, remedy = unknown(place)
     elif kind == "literal_error":
         allowed = words_allowed or _literals(detail)
         problem, remedy = f"{shortened(value)} is not allowed", did_you_mean(str(value), allowed)
     elif kind == "value_error":
         problem = detail["msg"].removeprefix("Value error, ")
-    elif place == ("beacon",):
-        problem, remedy = "[beacon] is one table", "each beacon's table starts with [[beacon]]"
+    elif place in (("beacon",), ("target",)):
+        name = place[0]
+        problem, remedy = f"[{name}] is one table", f"each {name}'s table starts with [[{name}]]"
     else:
         words = _WORDS.get(kind)
         problem = words.format(value=shortened(value)) if words else detail["msg"]
@@ -289,7 +318,7 @@ def _plain(
         " ".join(problem.split()),
         remedy,
         file=path,
-        record=_beacon_label(place, content),
+        record=_label(place, content),
         field=".".join(part for part in place if isinstance(part, str)),
     )
 
@@ -299,11 +328,13 @@ def _literals(detail: Any) -> list[str]:
     return re.findall(r"'([^']*)'", detail.get("ctx", {}).get("expected", ""))
 
 
-def _unknown_key(place: tuple[int | str, ...], form: str) -> tuple[str, str]:
+def _unknown_key(place: Place, form: str) -> tuple[str, str]:
     *tables, key = place
-    known = _keys(_FORMATS[form], tables)
+    if place == ("target",):
+        return "targets belong to a fleet", "each vehicle's table starts with [[vehicle]] then"
+    known = keys_of(_FORMATS[form], tables)
     for other, model in _FORMATS.items():
-        if key in _keys(model, tables):
+        if key in keys_of(model, tables):
             return (
                 f"'{key}' does not go with format = '{form}'",
                 f"it belongs to format = '{other}'; known here: {', '.join(known)}",
@@ -311,7 +342,7 @@ def _unknown_key(place: tuple[int | str, ...], form: str) -> tuple[str, str]:
     return f"unknown key '{key}'", did_you_mean(str(key), known)
 
 
-def _keys(model: type[BaseModel], tables: list[int | str]) -> tuple[str, ...]:
+def keys_of(model: type[BaseModel], tables: Sequence[int | str]) -> tuple[str, ...]:
     """Return the keys of the table that `tables` leads to, none where there is no such table."""
     found: type[BaseModel] | None = model
     for name in tables:
@@ -329,9 +360,11 @@ def _model_in(annotation: Any) -> type[BaseModel] | None:
     return next((m for m in map(_model_in, get_args(annotation)) if m), None)
 
 
-def _beacon_label(place: tuple[int | str, ...], content: dict[str, Any]) -> str | None:
-    if len(place) < 2 or place[0] != "beacon" or not isinstance(place[1], int):
+def _label(place: Place, content: dict[str, Any]) -> str | None:
+    """Which of several tables of one kind a place lies in, by its name."""
+    if len(place) < 2 or not isinstance(place[1], int):
         return None
-    table = content["beacon"][place[1]]
+    kind = str(place[0])
+    table = content[kind][place[1]]
     name = table.get("name") if isinstance(table, dict) else None
-    return f"beacon '{name}'" if isinstance(name, str) else f"beacon number {place[1] + 1}"
+    return f"{kind} '{name}'" if isinstance(name, str) else f"{kind} number {place[1] + 1}"

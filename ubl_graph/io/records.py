@@ -46,7 +46,10 @@ from ubl_graph.measurements import (
 
 
 def read_two_way_range(
-    file: str | Path, beacons: Sequence[Beacon] = (), sigma: float = TRAVEL_TIME_SIGMA
+    file: str | Path,
+    beacons: Sequence[Beacon] = (),
+    sigma: float = TRAVEL_TIME_SIGMA,
+    others: Sequence[str] = (),
 ) -> TwoWayRange:
     """Read pings and replies.
 
@@ -59,6 +62,8 @@ def read_two_way_range(
         Whose `turnaround` is taken out where a file gives neither.
     sigma : float
         Standard deviation of the travel time where the file has no column of it, s.
+    others : sequence of str
+        Names of what answers beside the beacons, without a turnaround that is known.
 
     Returns
     -------
@@ -72,6 +77,22 @@ def read_two_way_range(
         Where a turnaround is needed and the beacon has none.
     """
     table = opened("two_way_range", read_table(file))
+    return two_way_ranges(table, beacons, sigma, others)
+
+
+def two_way_ranges(
+    table: Table,
+    beacons: Sequence[Beacon],
+    sigma: float | FloatArray,
+    others: Sequence[str] = (),
+) -> TwoWayRange:
+    """Pings and replies of a table that was opened, as `read_two_way_range`; `sigma` may be (M,).
+
+    Raises
+    ------
+    DataError, ConfigurationError
+        As `read_two_way_range`.
+    """
     if "travel_time" in table:
         return records_of(TwoWayRange, "two_way_range", table, sigma=sigma)
     times = table.text("beacon"), table.numbers("t_transmit"), table.numbers("t_receive")
@@ -84,7 +105,7 @@ def read_two_way_range(
             spread,
             source=table.source,
         )
-    waits = _turnarounds(table, beacons)
+    waits = _turnarounds(table, beacons, others)
     return TwoWayRange.from_turnaround(*times, waits, spread, source=table.source)
 
 
@@ -283,23 +304,26 @@ def read_sound_speed(file: str | Path) -> SoundSpeedProfile:
         return SoundSpeedProfile(depth, speed)
 
 
-def _turnarounds(table: Table, beacons: Sequence[Beacon]) -> FloatArray:
+def _turnarounds(table: Table, beacons: Sequence[Beacon], others: Sequence[str]) -> FloatArray:
     """Turnaround of each row's beacon, s, shape (M,)."""
-    by_name = {beacon.name: beacon.turnaround for beacon in beacons}
+    by_name = dict.fromkeys(others) | {beacon.name: beacon.turnaround for beacon in beacons}
     names, inverse = np.unique(table.text("beacon"), return_inverse=True)
     waits = np.empty(len(names))
     for i, name in enumerate(names.tolist()):
         first = int(np.argmax(inverse == i))
         if name not in by_name:
+            what = "beacon, vehicle or target" if others else "beacon"
             raise table.source.error(
-                first, "beacon", f"unknown beacon '{name}'", did_you_mean(name, list(by_name))
+                first, "beacon", f"unknown {what} '{name}'", did_you_mean(name, list(by_name))
             )
         wait = by_name[name]
         if wait is None:
+            who = "" if name in others else "beacon "
+            remedy = f", or turnaround (s) to beacon '{name}'" if who else ""
             raise ConfigurationError(
-                f"no travel times are given, and beacon '{name}' states no turnaround to take out "
+                f"no travel times are given, and {who}'{name}' states no turnaround to take out "
                 "of receive minus transmit time",
-                f"add a column travel_time, or turnaround (s) to beacon '{name}'",
+                f"add a column travel_time{remedy}",
                 file=table.file,
                 row=int(table.source.row[first]),
                 line=int(table.source.line[first]),

@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 
 from ubl_graph.acoustics import SoundSpeedProfile
+from ubl_graph.arrays import FloatArray
 from ubl_graph.beacon import Beacon
-from ubl_graph.mission import Mission, Segment, Start
+from ubl_graph.cooperative.fleet import Fleet, Member, Target
+from ubl_graph.mission import Mission, Segment, Setup, Start
 from ubl_graph.records import Records
 
 #: A profile of more samples is thinned to these, for a file that people read.
@@ -35,25 +37,78 @@ def resolved(mission: Mission) -> dict[str, Any]:
         (first and last, s) and `start` (where there is one). Units as in a mission file. What has
         no value is left out, as TOML cannot say it.
     """
-    description: dict[str, Any] = {"name": mission.name}
-    if mission.origin is not None:
-        description["origin"] = _plain(asdict(mission.origin))
     return {
-        **description,
-        "beacons": [_beacon(beacon) for beacon in mission.beacons],
-        "sound_speed": _sound_speed(mission.sound_speed),
+        **_surroundings(mission),
         "vehicle": _plain(asdict(mission.vehicle)),
         "options": _options(mission),
         "segments": [_segment(segment) for segment in mission.segments],
     }
 
 
+def resolved_fleet(fleet: Fleet) -> dict[str, Any]:
+    """Describe a fleet by what JSON and TOML can hold.
+
+    Parameters
+    ----------
+    fleet : Fleet
+
+    Returns
+    -------
+    dict
+        Keys `name`, `origin` (where there is one), `beacons`, `sound_speed`, `options` (of the
+        whole), `vehicles` and `targets`. Of each vehicle `name`, lever arms, `options` in force,
+        `records`, `time_span` and `start`, as of a mission and its segment; of each target `name`,
+        `position`, `sigma`, `velocity_sigma` and `t`.
+    """
+    return {
+        **_surroundings(fleet),
+        "options": _options(fleet.setup),
+        "vehicles": [_member(fleet, member) for member in fleet.vehicles],
+        "targets": [_target(target) for target in fleet.targets],
+    }
+
+
+def _surroundings(whole: Mission | Fleet) -> dict[str, Any]:
+    description: dict[str, Any] = {"name": whole.name}
+    if whole.origin is not None:
+        description["origin"] = _plain(asdict(whole.origin))
+    return {
+        **description,
+        "beacons": [_beacon(beacon) for beacon in whole.beacons],
+        "sound_speed": _sound_speed(whole.sound_speed),
+    }
+
+
+def _member(fleet: Fleet, member: Member) -> dict[str, Any]:
+    return {
+        "name": member.name,
+        **_plain(asdict(member.vehicle)),
+        "options": _options(fleet.mission_of(member.name)),
+        **{key: value for key, value in _segment(member.segment).items() if key != "name"},
+    }
+
+
+def _target(target: Target) -> dict[str, Any]:
+    return _plain(
+        {
+            "name": target.name,
+            "position": None if target.position is None else _enu(target.position),
+            "sigma": target.sigma.tolist(),
+            "velocity_sigma": target.velocity_sigma.tolist(),
+            "t": target.t,
+        }
+    )
+
+
+def _enu(position: FloatArray) -> dict[str, float]:
+    return dict(zip(("east", "north", "up"), position.tolist(), strict=True))
+
+
 def _beacon(beacon: Beacon) -> dict[str, Any]:
-    east, north, up = beacon.position.tolist()
     return _plain(
         {
             "name": beacon.name,
-            "position": {"east": east, "north": north, "up": up},
+            "position": _enu(beacon.position),
             "sigma": beacon.sigma.tolist(),
             "turnaround": beacon.turnaround,
         }
@@ -72,7 +127,7 @@ def _sound_speed(profile: SoundSpeedProfile) -> dict[str, Any]:
     }
 
 
-def _options(mission: Mission) -> dict[str, Any]:
+def _options(mission: Mission | Setup) -> dict[str, Any]:
     options = mission.options
     stated = {f.name: getattr(options, f.name) for f in fields(options)}
     in_force = {
@@ -93,7 +148,7 @@ def _segment(segment: Segment) -> dict[str, Any]:
     return {
         "name": segment.name,
         "records": {kind: len(r) for kind, r in records.items()},
-        "time_span": [min(t for t, _ in times), max(t for _, t in times)],
+        **({"time_span": [min(t for t, _ in times), max(t for _, t in times)]} if times else {}),
         **({} if segment.start is None else {"start": _start(segment.start)}),
     }
 

@@ -1,18 +1,9 @@
-"""Writing a Result into a folder: tables, JSON, the resolved mission, figures.
-
-All files are written beside the target first and moved in at the end, so that a failure leaves
-nothing half-written.
-"""
+"""Writing a Result into a folder: tables, JSON, the resolved mission, figures."""
 
 from __future__ import annotations
 
-import csv
-import json
 import platform
-import shutil
-import tempfile
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -20,9 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from ubl_graph.arrays import FloatArray
-from ubl_graph.errors import DataError
+from ubl_graph.cooperative.result import FleetResiduals
 from ubl_graph.evaluation import Errors, evaluate
+from ubl_graph.io.output_folder import (
+    names_in,
+    number_cells,
+    scientific_cell,
+    staged,
+    time_cell,
+    write_json,
+    write_rows,
+)
 from ubl_graph.io.pose_columns import (
     ATTITUDE_COLUMNS,
     COVARIANCE_COLUMNS,
@@ -85,39 +84,26 @@ def write_result(
         Where the folder cannot be made or written to; then nothing is left behind.
     """
     folder = Path(folder)
-    with _staged(folder) as stage:
+    with staged(folder) as stage:
         has_poses = any(pose_tracks(result))
         columns = TRAJECTORY_COLUMNS + (ATTITUDE_COLUMNS if has_poses else ())
-        _write_rows(stage / "trajectory.csv", columns, _trajectory_rows(result))
+        write_rows(stage / "trajectory.csv", columns, _trajectory_rows(result))
         if has_poses:
             rows = _covariance_rows(result)
-            _write_rows(stage / "pose_covariance.csv", COVARIANCE_COLUMNS, rows)
+            write_rows(stage / "pose_covariance.csv", COVARIANCE_COLUMNS, rows)
         if result.residuals is not None:
-            _write_rows(stage / "residuals.csv", RESIDUAL_COLUMNS, _residual_rows(result))
+            write_rows(stage / "residuals.csv", RESIDUAL_COLUMNS, _residual_rows(result))
         if any(s.slow for s in result.segments):
             columns, rows = _slow_table(result)
-            _write_rows(stage / "slow_states.csv", columns, rows)
-        _write_json(stage / "result.json", summary(result))
-        _write_json(stage / "mission.json", resolved(result.mission))
+            write_rows(stage / "slow_states.csv", columns, rows)
+        write_json(stage / "result.json", summary(result))
+        write_json(stage / "mission.json", resolved(result.mission))
         if figures:
             from ubl_graph import plots  # matplotlib is heavy: only who draws pays for it
 
             plots.save_all(result, stage, beside)
-        names = sorted(p.name for p in stage.iterdir())
+        names = names_in(stage)
     return [folder / name for name in names]
-
-
-def check_folder(folder: str | Path) -> None:
-    """Refuse an output that is a file (before hours of work, not after); write nothing.
-
-    Raises
-    ------
-    DataError
-        Where `folder` exists and is no folder.
-    """
-    folder = Path(folder)
-    if (folder.exists() or folder.is_symlink()) and not folder.is_dir():
-        raise DataError("the output is a file, not a folder", "name a folder", file=folder)
 
 
 def summary(result: Result) -> dict[str, Any]:
@@ -145,7 +131,7 @@ def summary(result: Result) -> dict[str, Any]:
             for name, s in result.shared.items()
         },
         "segments": [
-            {**_segment_summary(s, errors.get(s.name)), **_odometry_noise(result.mission, s.name)}
+            {**segment_summary(s, errors.get(s.name)), **_odometry_noise(result.mission, s.name)}
             for s in result.segments
         ],
         **({} if result.tuning is None else {"tuning": asdict(result.tuning)}),
@@ -173,7 +159,8 @@ def _problems(result: Result) -> list[SegmentResult]:
     return list({s.problem: s for s in result.segments}.values())
 
 
-def _segment_summary(segment: SegmentResult, errors: Errors | None) -> dict[str, Any]:
+def segment_summary(segment: SegmentResult, errors: Errors | None) -> dict[str, Any]:
+    """What result.json says of a segment; `errors` against its reference, where it has one."""
     sd = np.sqrt(np.einsum("nii->ni", segment.trajectory.covariance))
     content: dict[str, Any] = {
         "name": segment.name,
@@ -239,13 +226,13 @@ def _trajectory_rows(result: Result) -> Iterator[list[str]]:
                 parts[1] = np.full_like(track.velocity, np.nan)
         table = np.column_stack(parts)
         for t, row in zip(track.t, table, strict=True):
-            yield [segment.name, _time(t), *_numbers(row)]
+            yield [segment.name, time_cell(t), *number_cells(row)]
 
 
 def _covariance_rows(result: Result) -> Iterator[list[str]]:
     for name, track in pose_tracks(result):
         for t, row in zip(track.t, covariance_table(track), strict=True):
-            yield [name, _time(t), *(_scientific(v, 9) for v in row)]
+            yield [name, time_cell(t), *(scientific_cell(v, 9) for v in row)]
 
 
 def _residual_rows(result: Result) -> Iterator[list[str]]:
@@ -253,19 +240,23 @@ def _residual_rows(result: Result) -> Iterator[list[str]]:
         r = segment.residuals
         if r is None:
             continue
-        for i in range(len(r)):
-            yield [
-                segment.name,
-                str(r.kind[i]),
-                str(r.beacon[i]),
-                _time(r.t_transmit[i]),
-                _time(r.t_receive[i]),
-                f"{r.travel_time[i]:.9f}",
-                f"{r.residual[i]:.9f}",
-                f"{r.sigma[i]:.3e}",
-                f"{r.weight[i]:.4f}",
-                "yes" if r.found[i] else "no",
-            ]
+        for i, cells in enumerate(residual_cells(r)):
+            yield [segment.name, str(r.kind[i]), str(r.beacon[i]), *cells]
+
+
+def residual_cells(residuals: RangeResiduals | FleetResiduals) -> Iterator[list[str]]:
+    """Of each range what stands in `RESIDUAL_COLUMNS` behind the names of its ends."""
+    r = residuals
+    for i in range(len(r)):
+        yield [
+            time_cell(r.t_transmit[i]),
+            time_cell(r.t_receive[i]),
+            f"{r.travel_time[i]:.9f}",
+            f"{r.residual[i]:.9f}",
+            f"{r.sigma[i]:.3e}",
+            f"{r.weight[i]:.4f}",
+            "yes" if r.found[i] else "no",
+        ]
 
 
 def _slow_table(result: Result) -> tuple[list[str], Iterator[list[str]]]:
@@ -278,88 +269,10 @@ def _slow_table(result: Result) -> tuple[list[str], Iterator[list[str]]]:
             values = np.concatenate([s.value for s in states], axis=1)
             sigmas = np.concatenate([s.sigma for s in states], axis=1)
             for t, value, sigma in zip(segment.trajectory.t, values, sigmas, strict=True):
-                yield [segment.name, _time(t), *(_scientific(v, 6) for v in (*value, *sigma))]
+                yield [
+                    segment.name,
+                    time_cell(t),
+                    *(scientific_cell(v, 6) for v in (*value, *sigma)),
+                ]
 
     return ["segment", "t", *components, *(f"sd_{c}" for c in components)], rows()
-
-
-def _time(t: float) -> str:
-    """All digits of a stamp: what reads it back finds the very same float."""
-    return repr(float(t))
-
-
-def _numbers(row: FloatArray) -> list[str]:
-    return [_number(v) for v in row]
-
-
-def _number(v: float) -> str:
-    """A micrometre, and never "-0.000000"; nothing where there is no number."""
-    if not np.isfinite(v):
-        return ""
-    return f"{v:.6f}" if abs(v) >= 5e-7 else "0.000000"
-
-
-def _scientific(v: float, digits: int) -> str:
-    return f"{v:.{digits}e}" if np.isfinite(v) else ""
-
-
-def _write_rows(path: Path, columns: Iterable[str], rows: Iterable[list[str]]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows(rows)
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    path.write_text(json.dumps(_finite(content), indent=2) + "\n", encoding="utf-8")
-
-
-def _finite(value: Any) -> Any:
-    """JSON knows no infinity and no NaN: null stands for them."""
-    if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(v) for v in value]
-    if isinstance(value, (float, np.floating)):
-        return float(value) if np.isfinite(value) else None
-    return value.item() if isinstance(value, np.generic) else value
-
-
-@contextmanager
-def _staged(folder: Path) -> Generator[Path]:
-    """A folder beside the target, moved into it when all went well, removed when not."""
-    check_folder(folder)
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        stage = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise DataError(
-            f"the output folder cannot be made ({reason})",
-            "name a folder you may write",
-            file=folder,
-        ) from error
-    try:
-        yield stage
-        _move_in(stage, folder)
-    finally:
-        shutil.rmtree(stage, ignore_errors=True)
-
-
-def _move_in(stage: Path, folder: Path) -> None:
-    """Let the staged files take their places: all of them, or none where one cannot."""
-    blocked = [path.name for path in stage.iterdir() if (folder / path.name).is_dir()]
-    if blocked:
-        raise DataError(
-            f"'{blocked[0]}' in the output folder is a folder", "move it away", file=folder
-        )
-    try:
-        if folder.exists():
-            for path in stage.iterdir():
-                path.replace(folder / path.name)
-        else:
-            stage.chmod(0o755)
-            stage.replace(folder)
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise DataError(f"the output cannot be written ({reason})", file=folder) from error
