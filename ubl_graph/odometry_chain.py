@@ -132,7 +132,7 @@ def compounded(
     opens = np.concatenate([[True], ~follows | wanted | (np.diff(way) > 0.0)])
     first = np.flatnonzero(opens)
     last = np.append(first[1:], len(opens)) - 1
-    return _records(t_from[first], t_to[last], _composed(pieces, np.cumsum(opens) - 1))
+    return _records(t_from[first], t_to[last], composed(pieces, np.cumsum(opens) - 1))
 
 
 def steps_of(records: Odometry, *, planar: bool) -> Steps:
@@ -227,9 +227,18 @@ def _pieces(records: Odometry, options: Options, which: IntArray, share: FloatAr
     return Steps(lie.rotation(turn), way, noise)
 
 
-def _composed(pieces: Steps, group: IntArray) -> Steps:
-    """Pieces of each group put one after the other; groups are numbered in order.
+def composed(pieces: Steps, group: IntArray) -> Steps:
+    """Steps of each group put one after the other.
 
+    Parameters
+    ----------
+    pieces : Steps
+        In order.
+    group : array of int, shape (M,)
+        Whose each one is, not decreasing.
+
+    Notes
+    -----
     Neighbours are joined pairwise until one is left: as many passes as the longest group has
     binary digits.
     """

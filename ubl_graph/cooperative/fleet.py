@@ -106,7 +106,7 @@ class Target:
             object.__setattr__(self, name, values)
         if self.t is not None and not np.isfinite(self.t):
             raise self._error("t", f"{self.t} is not finite", "give seconds")
-        if position is None and (self.sigma < UNKNOWN_PLACE)[:2].any():
+        if position is None and (self.sigma < UNKNOWN_PLACE).any():
             raise self._error("sigma", "a sigma of no position", "give position too")
 
     @property
@@ -179,6 +179,7 @@ class Fleet:
             raise ConfigurationError("the fleet has no vehicle", field="vehicle")
         check_names(self.beacons)
         self._check_names()
+        self.options.require_settled()
         for member in self.vehicles:
             check_node(member.options, member.segment.start)
             member.options.require_settled()
@@ -302,22 +303,24 @@ class Fleet:
         spans = {v.name: span_of(v.segment) for v in self.vehicles}
         for pings in ranges_of(member.segment).values():
             times = leg_times(pings)
-            for name in (n for n in np.unique(pings.beacon) if str(n) in spans):
+            for name in np.unique(pings.beacon):
                 rows = np.flatnonzero(pings.beacon == name)
                 for who in (str(name), member.name):
-                    span = spans[who]
-                    if span is None:
+                    span = spans.get(who)
+                    if span is None or str(name) in self.beacon_names:
                         continue
                     early = times[rows].min(axis=1) < span[0] - EPOCH_SLACK
                     late = times[rows].max(axis=1) > span[1] + EPOCH_SLACK
                     if (early | late).any():
                         i = int(rows[np.argmax(early | late)])
+                        differ = f"the clocks of '{member.name}' and '{name}' seem to differ"
+                        if str(name) not in spans:
+                            differ = f"the clocks of the ranges to '{name}' and of these differ"
                         raise pings.error(
                             i,
                             "t" if hasattr(pings, "t") else "t_receive",
                             f"{times[i, -1]} s: vehicle '{who}' has records from {span[0]} to "
-                            f"{span[1]} s only, so the clocks of '{member.name}' and '{name}' seem "
-                            "to differ by hours",
+                            f"{span[1]} s only, so {differ} by hours",
                             "bring all vehicles' stamps to one epoch",
                         )
 

@@ -35,18 +35,20 @@ class FleetMarginals:
         self._layout = problem.layout
         equations = NormalEquations(problem)
         point = equations.evaluate(solution.x, solution.frozen)
-        self._found = _Inverse(equations, point, RIDGES)
+        # No single residual need join all that two neighbouring nodes hold.
+        spans = [self._span(i) for i in range(len(problem.layout.vehicles))]
+        reach = max(equations.shape.reach, *spans)
+        self._found = _Inverse(equations, point, RIDGES, reach)
         self._larger: _Inverse | None = None
         if self._found.doubtful:
             # What a larger ridge lowers, the ridge has made, or rounding has.
             ridge = max(10.0 * self._found.ridge, DOUBTFUL_PIVOT)
-            self._larger = _Inverse(equations, point, [ridge])
+            self._larger = _Inverse(equations, point, [ridge], reach)
 
     def vehicle(self, number: int) -> Covariances:
         """Those of one vehicle, by its own layout."""
         layout, place = self._layout.vehicles[number], self._layout.place[number]
-        columns = place[: layout.inner].reshape(layout.node_count, layout.node_width)
-        border = place[layout.inner :]
+        columns, border = self._columns(number), place[layout.inner :]
         found = self._found
         node = found.of(columns, columns)
         following = found.of(columns[:-1], columns[1:])
@@ -58,6 +60,17 @@ class FleetMarginals:
             unresolved = np.einsum("nii->n", larger) < 0.5 * before
         shared = found.border(border, border)
         return Covariances(layout, node, following, shared, found.scale[place], unresolved)
+
+    def _columns(self, number: int) -> IntArray:
+        """Columns of each node of a vehicle, (N, W)."""
+        layout, place = self._layout.vehicles[number], self._layout.place[number]
+        return place[: layout.inner].reshape(layout.node_count, layout.node_width)
+
+    def _span(self, number: int) -> int:
+        """Diagonals that neighbouring nodes of a vehicle need."""
+        columns = self._columns(number)
+        width = columns.shape[1]
+        return int((columns[1:, -1] - columns[:-1, 0]).max(initial=width - 1)) + 1
 
     def common(self, names: Sequence[str]) -> FloatArray:
         """Joint covariance of some of what belongs to no vehicle, SI, in this order."""
@@ -73,7 +86,9 @@ class FleetMarginals:
 class _Inverse:
     """The scaled inverse where it is asked for, with the first ridge that lets it be computed."""
 
-    def __init__(self, equations: NormalEquations, point: Point, ridges: Sequence[float]) -> None:
+    def __init__(
+        self, equations: NormalEquations, point: Point, ridges: Sequence[float], reach: int
+    ) -> None:
         factor, self.scale, self.ridge = scaled_factor(equations, point, ridges)
         pivots = factor.band[0]
         self._inner = factor.band.shape[1]
@@ -84,7 +99,8 @@ class _Inverse:
             self._corner = factor.inverse_corner()
             pivots = np.append(pivots, factor.corner.diagonal())
         self.doubtful = self.ridge > 0.0 or float(pivots.min()) ** 2 < DOUBTFUL_PIVOT
-        self._band = inverse_band(factor.band)
+        rows = np.zeros((reach - len(factor.band), self._inner))
+        self._band = inverse_band(np.concatenate([factor.band, rows]))
 
     def of(self, rows: IntArray, columns: IntArray) -> FloatArray:
         """Blocks (N, R, C) between the nodes' columns `rows` (N, R) and `columns` (N, C)."""

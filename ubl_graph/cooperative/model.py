@@ -19,16 +19,20 @@ from ubl_graph.factors.loss import RobustLoss
 from ubl_graph.factors.ranges import FreeAntenna, PointAntenna, RangeBlock
 from ubl_graph.graph import build_problem, builder_of, layout_of, model_segment
 from ubl_graph.layout import Interpolation, Layout
-from ubl_graph.measurements import SlantRange
+from ubl_graph.measurements import Odometry, SlantRange
 from ubl_graph.mission import Mission, Segment, Start
 from ubl_graph.odometry_chain import compounded
 from ubl_graph.options import Options
 from ubl_graph.pings import along_distances, leg_times, travel_time_model
+from ubl_graph.pose_states import odometry_sigmas
 from ubl_graph.problem import LeastSquares, Problem
 
 #: Odometry is compounded over no more than this, s: a node that stands for long joins all that
 #: stand beside it in time, and the equations' band grows with it.
 LONGEST_STEP = 60.0
+#: Nor over more of a turn, rad, where its scale or turn bias are unknowns: over an arc these change
+#: the way's length and bend, which the compound's residual takes for that of a straight way.
+LARGEST_TURN = 0.1
 #: A known component of a target's place or velocity is held to within this, m and m/s.
 HELD = 1e-4
 
@@ -102,7 +106,7 @@ def model_member(fleet: Fleet, member: Member, pings: Sequence[PeerPings]) -> Me
     view = _seen_by_nodes(segment, member.name, pings)
     if _compoundable(segment, options):
         assert segment.odometry is not None
-        steps = compounded(segment.odometry, _wanted(view), options)
+        steps = compounded(segment.odometry, _wanted(view, options), options)
         segment, view = (replace(s, odometry=steps) for s in (segment, view))
     model = replace(model_segment(view, options), segment=segment)
     mission = fleet.mission_of(member.name)
@@ -125,11 +129,15 @@ def _seen_by_nodes(segment: Segment, name: str, pings: Sequence[PeerPings]) -> S
     if len(times):
         sigmas = np.concatenate([s for _, s in found])
         return replace(segment, slant_range=SlantRange(times, "", 1.0, sigmas.clip(1e-6, 1e4)))
-    if {"two_way_range", "one_way_range", "position"} & segment.records().keys() or segment.start:
+    if {"two_way_range", "one_way_range", "position"} & segment.records().keys():
         return segment
-    # Nothing says where it is; but it went somewhere.
-    span = span_of(segment) or (0.0, 0.0)
-    return replace(segment, start=Start(span[0], 0.0, 0.0, sigma=FREE_POSITION))
+    start = segment.start
+    if start is None:
+        # Nothing says where it is; but it went somewhere.
+        span = span_of(segment) or (0.0, 0.0)
+        start = Start(span[0], 0.0, 0.0, sigma=FREE_POSITION)
+    once = SlantRange(start.t, "", 1.0, float(np.clip(start.sigma, 1e-6, 1e4)))
+    return replace(segment, start=start, slant_range=once)
 
 
 def _compoundable(segment: Segment, options: Options) -> bool:
@@ -141,7 +149,7 @@ def _compoundable(segment: Segment, options: Options) -> bool:
     return "odometry" in present and not others & present
 
 
-def _wanted(view: Segment) -> FloatArray:
+def _wanted(view: Segment, options: Options) -> FloatArray:
     """Times at which a vehicle that odometry moves needs a node, s."""
     assert view.odometry is not None
     times = [np.array([view.odometry.t_from.min(), view.odometry.t_to.max()])]
@@ -153,6 +161,8 @@ def _wanted(view: Segment) -> FloatArray:
         times.append(view.position.t)
     if view.start is not None:
         times.append(np.array([view.start.t]))
+    if any(odometry_sigmas(options).values()):
+        times.append(_turns(view.odometry))
     wanted = np.unique(np.concatenate(times))
     gaps: FloatArray = np.diff(wanted)
     more = [
@@ -160,6 +170,18 @@ def _wanted(view: Segment) -> FloatArray:
         for i in np.flatnonzero(gaps > LONGEST_STEP)
     ]
     return np.unique(np.concatenate([wanted, *more]))
+
+
+def _turns(records: Odometry) -> FloatArray:
+    """Times at which the heading has changed by `LARGEST_TURN` since the last one, s."""
+    order = np.argsort(records.t_to, kind="stable")
+    heading = np.cumsum(records.rotation_vector[order, 2])
+    last, found = 0.0, list[int]()
+    for i, now in enumerate(heading.tolist()):
+        if abs(now - last) > LARGEST_TURN:
+            found.append(i)
+            last = now
+    return records.t_to[order[found]]
 
 
 def build_fleet(

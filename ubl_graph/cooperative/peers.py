@@ -2,8 +2,9 @@
 
 A vehicle that asks is at the ping's transmit time when it asks and at its receive time when the
 reply arrives; the one that replies hears the ping half the travel time after the first and sends
-half of it before the second. Between the legs the vehicles move by less than 1/500 of sound's
-way, and what that makes the halves differ by is some 1e-3 s: a millimetre of the replier's way.
+half of it before the second. The halves differ by what the range changes until the answer: a range
+that changes by 3 m/s makes them differ by 1 ms for each second that the answer takes, and moves the
+replier's place by a millimetre or two.
 """
 
 from __future__ import annotations

@@ -14,19 +14,18 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from ubl_graph.arrays import FloatArray
-from ubl_graph.assembly import beacons_of
 from ubl_graph.cooperative.assembly import (
     assemble_member,
     assemble_residuals,
     assemble_target,
     unseen_target,
 )
-from ubl_graph.cooperative.fleet import Fleet, ranges_of
+from ubl_graph.cooperative.fleet import UNKNOWN_PLACE, Fleet, ranges_of
 from ubl_graph.cooperative.marginals import FleetMarginals
 from ubl_graph.cooperative.model import FleetProblem, MemberModel, build_fleet, model_member
 from ubl_graph.cooperative.peers import PeerPings, peer_pings
 from ubl_graph.cooperative.result import FleetResiduals, FleetResult, TargetEstimate
-from ubl_graph.cooperative.starts import find_fleet_starts, reckons
+from ubl_graph.cooperative.starts import find_fleet_starts, reckons, with_clocks
 from ubl_graph.cooperative.targets import TargetStart, target_starts
 from ubl_graph.initial import Starts
 from ubl_graph.layout import Layout
@@ -81,19 +80,25 @@ def smooth_fleet(fleet: Fleet, progress: Progress | None = None) -> FleetResult:
     for part in parts:
         whose = f" of {', '.join(part.vehicles)}" if several else ""
         shared |= {name + whose: state for name, state in part.shared.items()}
-    for result in results.values():
-        shared |= {n: s for n, s in result.shared.items() if n.startswith("beacon ")}
-    whole = next(iter(results.values())).mission
+    beacons = {
+        name: min((r.beacons[name] for r in results.values()), key=_uncertainty)
+        for name in fleet.beacon_names
+    }
     return FleetResult(
         fleet,
         {v.name: results[v.name] for v in fleet.vehicles},
         {t.name: found[t.name] for t in fleet.targets},
         FleetResiduals.joined(residuals) if residuals else None,
-        {n: s for n, s in shared.items() if not n.startswith("beacon ")},
-        beacons_of(whole, shared),
+        shared,
+        beacons,
         tuple(work.warnings),
         work.wall_times,
     )
+
+
+def _uncertainty(state: Shared) -> float:
+    """Sum of the variances: vehicles that are solved apart each have an answer of their own."""
+    return float(np.trace(state.covariance))
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,6 +151,7 @@ def _smooth_group(work: Work, fleet: Fleet, number: int) -> _Part:
         starts = find_fleet_starts(fleet, members, pings)
         ways = {m.name: (m.model.t, starts[m.name].tracks[0].position) for m in members}
         places = {t.name: target_starts(fleet, t, pings, ways) for t in fleet.targets}
+        starts = with_clocks(fleet, members, pings, starts, places)
     with work.stage("solve"):
         firsts = {name: found[0].position for name, found in places.items()}
         problem = build_fleet(fleet, members, pings, firsts)
@@ -231,6 +237,8 @@ def _place_target(problem: FleetProblem, name: str, start: TargetStart, x: Float
 
 def _anchored(fleet: Fleet) -> bool:
     """Whether anything ties the vehicles that ranges join to the map."""
+    if any((target.sigma < UNKNOWN_PLACE)[:2].all() for target in fleet.targets):
+        return True
     beacons = np.array(fleet.beacon_names, dtype=np.str_)
     return any(
         member.segment.start is not None

@@ -16,9 +16,9 @@ from ubl_graph.arrays import FloatArray
 from ubl_graph.beacon import Beacon
 from ubl_graph.builder import FREE_POSITION
 from ubl_graph.cooperative.fleet import Fleet
-from ubl_graph.cooperative.model import MemberModel
+from ubl_graph.cooperative.model import MemberModel, reference_time
 from ubl_graph.cooperative.peers import PeerPings
-from ubl_graph.cooperative.targets import Way
+from ubl_graph.cooperative.targets import SAME_CLOCK, TargetStart, Way, places_on
 from ubl_graph.errors import UnobservableError
 from ubl_graph.initial import Starts
 from ubl_graph.measurements import SlantRange
@@ -28,8 +28,12 @@ from ubl_graph.pose_initial import find_tracks, reckoned_track
 
 #: Ranges to others that a search looks at; more are thinned out evenly.
 MOST_RANGES = 200
-#: A range between clocks that may differ by more than this is no distance, s.
-SAME_CLOCK = 1e-2
+#: One-way ranges are this far off where tracks are only begun, at the least, s: 15 m.
+ROUGH = 1e-2
+#: No clock is known better to begin with, s and s/s.
+LEAST_CLOCK = 1e-12
+#: Passes in which those that are off by more lose their say.
+CLOCK_PASSES = 10
 
 
 def find_fleet_starts(
@@ -61,6 +65,89 @@ def find_fleet_starts(
         found[name] = _searched(member, ranges[name])
         ways[name] = (member.model.t, found[name].tracks[0].position)
     return found
+
+
+def with_clocks(
+    fleet: Fleet,
+    members: Sequence[MemberModel],
+    pings: Sequence[PeerPings],
+    starts: Mapping[str, Starts],
+    places: Mapping[str, Sequence[TargetStart]],
+) -> dict[str, Starts]:
+    """The same starts, with the clocks that one-way ranges ask for.
+
+    A robust loss takes all of these for outliers where the search begins with clocks that are off
+    by more than a few of their standard deviations, and learns nothing from them.
+
+    Parameters
+    ----------
+    fleet, members, pings
+        As for `find_fleet_starts`.
+    starts : mapping of str to Starts
+        Of the vehicles.
+    places : mapping of str to sequence of TargetStart
+        Where targets may be, the best first.
+    """
+    ways = {m.name: (m.model.t, starts[m.name].tracks[0].position) for m in members}
+    ends = np.array([min(t[0] for t, _ in ways.values()), max(t[-1] for t, _ in ways.values())])
+    for target in fleet.targets:
+        first = places[target.name][0]
+        since = ends - reference_time(target, pings) if target.moves else np.zeros(2)
+        ways[target.name] = (ends, first.position + since[:, None] * first.velocity)
+    for beacon in fleet.beacons:
+        ways[beacon.name] = (ends, np.tile(beacon.position, (2, 1)))
+    middle = float(ends.mean())
+    offset, drift = _clocks(fleet, members, ways, middle)
+    return {
+        m.name: replace(
+            starts[m.name],
+            tracks=tuple(
+                replace(track, clock=offset[i] + drift[i] * (m.model.t - middle))
+                for track in starts[m.name].tracks
+            ),
+        )
+        for i, m in enumerate(members)
+    }
+
+
+def _clocks(
+    fleet: Fleet, members: Sequence[MemberModel], ways: Mapping[str, Way], middle: float
+) -> tuple[FloatArray, FloatArray]:
+    """Offset (s) at the time `middle` and drift of each vehicle's clock, (V,) each.
+
+    The one-way ranges' least sum of absolute values, by least squares over and over.
+    """
+    count = len(members)
+    number = {m.name: i for i, m in enumerate(members)}
+    speed = float(np.mean(fleet.sound_speed.speed))
+    matrix, value = [np.empty((0, count, 2))], [np.empty(0)]
+    for i, member in enumerate(members):
+        rows = member.member.segment.one_way_range
+        if rows is None or not len(rows):
+            continue
+        here = places_on(ways, np.full(len(rows), member.name), rows.t_receive)
+        there = places_on(ways, rows.beacon, rows.t_transmit)
+        value.append(rows.travel_time - np.linalg.norm(here - there, axis=1) / speed)
+        own = np.zeros((len(rows), count + 1, 2))
+        own[:, i] += np.stack([np.ones(len(rows)), rows.t_receive - middle], axis=1)
+        # Beacons and targets keep the fleet's time: their column is dropped.
+        sender = [number.get(str(name), count) for name in rows.beacon]
+        sent = np.stack([np.ones(len(rows)), rows.t_transmit - middle], axis=1)
+        own[np.arange(len(rows)), sender] -= sent
+        matrix.append(own[:, :count])
+    a, b = np.concatenate(matrix).reshape(-1, 2 * count), np.concatenate(value)
+    sigmas = [
+        (m.mission.options.clock_offset_sigma, m.mission.options.clock_drift_sigma) for m in members
+    ]
+    known = np.diag(np.maximum(np.ravel(sigmas), LEAST_CLOCK) ** -2.0)
+    weight = np.full(len(b), ROUGH**-2)
+    found = np.zeros(2 * count)
+    for _ in range(CLOCK_PASSES):
+        squared = a.T @ (weight[:, None] * a) + known
+        found = np.asarray(np.linalg.solve(squared, a.T @ (weight * b)), dtype=np.float64)
+        weight = 1.0 / (ROUGH * np.maximum(np.abs(b - a @ found), ROUGH))
+    offset, drift = found.reshape(count, 2).T
+    return offset, drift
 
 
 def reckons(member: MemberModel) -> bool:
@@ -139,11 +226,29 @@ def _searched(member: MemberModel, ranges: list[tuple[float, FloatArray, float, 
             sigmas = np.concatenate([own.sigma, sigmas])
         segment = replace(segment, slant_range=SlantRange(t, names, distances, sigmas))
         mission = replace(mission, beacons=(*mission.beacons, *beacons), segments=(segment,))
+    kinds = {"two_way_range", "one_way_range", "slant_range", "position"}
+    if segment.start is None and not kinds & segment.records().keys():
+        return _anywhere(member)
     try:
         return find_tracks(mission, replace(model, segment=segment))
     except UnobservableError:
-        middle = mission.beacons[0].position if mission.beacons else np.zeros(3)
-        anywhere = Start(float(model.t[0]), middle[0], middle[1], middle[2], FREE_POSITION)
-        heading = None if mission.options.node == "point" else 0.0
-        anywhere = replace(anywhere, heading=heading, heading_sigma=np.pi)
-        return find_tracks(mission, replace(model, segment=replace(segment, start=anywhere)))
+        return _anywhere(member)
+
+
+def _anywhere(member: MemberModel) -> Starts:
+    """A start where nothing says where a vehicle is.
+
+    It lies where the priors have their middles: all places and headings are as good, and from any
+    other the solver would creep there.
+    """
+    model, mission = member.model, member.mission
+    middle = np.zeros(3)
+    if mission.beacons:
+        middle = np.mean([b.position for b in mission.beacons], axis=0)
+    start = Start(float(model.t[0]), middle[0], middle[1], middle[2], FREE_POSITION)
+    if mission.options.node != "point":
+        # As if known: then the way is reckoned, and nothing is searched.
+        start = replace(start, heading=0.5 * np.pi, heading_sigma=1e-3)
+    model = replace(model, segment=replace(model.segment, start=start))
+    reckoned = reckoned_track(mission, model)
+    return find_tracks(mission, model) if reckoned is None else Starts((reckoned,), None)

@@ -18,6 +18,12 @@ from ubl_graph.nodes import NOMINAL_SPEED
 BEARINGS = 48
 #: So many of them are followed to the bottom.
 FOLLOWED = 6
+#: A range between clocks that may differ by more than this is no distance, s.
+SAME_CLOCK = 1e-2
+#: Where no distance says how far a target is, it is sought at these shares of the vehicles' extent,
+SHARES = (0.3, 1.0, 3.0)
+#: and at this distance at the least, m.
+NEAREST = 100.0
 #: Answers nearer than this, m, or than so many standard deviations of a range, are one.
 SAME_PLACE, SAME_SIGMAS = 1.0, 3.0
 
@@ -81,18 +87,26 @@ def target_starts(
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """Distances to a target, m, from where and after which time, s."""
+    """Distances to a target, m, from where and after which time, s.
+
+    `clock` numbers the vehicles whose clock is not known, which all their distances have in common;
+    -1 where it is.
+    """
 
     place: FloatArray
     distance: FloatArray
     sigma: FloatArray
     later: FloatArray
+    clock: FloatArray
 
     def residuals(self, position: FloatArray, velocity: FloatArray) -> FloatArray:
         """Whitened, (..., M), for positions (..., 3) and a velocity (3,)."""
         there = position[..., None, :] + self.later[:, None] * velocity
-        apart = np.linalg.norm(there - self.place, axis=-1)
-        return (apart - self.distance) / self.sigma
+        off = np.linalg.norm(there - self.place, axis=-1) - self.distance
+        for number in np.unique(self.clock[self.clock >= 0]):
+            own = self.clock == number
+            off[..., own] -= off[..., own].mean(axis=-1, keepdims=True)
+        return off / self.sigma
 
 
 def _seen(
@@ -100,23 +114,32 @@ def _seen(
 ) -> _Seen:
     epoch = reference_time(target, pings) if target.moves else 0.0
     speed = float(np.mean(fleet.sound_speed.speed))
-    clocks = {v.name: v.options.clock_offset_sigma for v in fleet.vehicles}
-    columns: list[tuple[FloatArray, ...]] = [(np.empty((0, 3)), *[np.empty(0)] * 3)]
+    unknown = {
+        v.name: i if v.options.clock_offset_sigma > SAME_CLOCK else -1
+        for i, v in enumerate(fleet.vehicles)
+    }
+    columns: list[tuple[FloatArray, ...]] = [(np.empty((0, 3)), *[np.empty(0)] * 4)]
     for p in pings:
         rows = np.flatnonzero(p.peer == target.name)
         metres = (NOMINAL_SPEED if p.kind == "slant_range" else speed) / p.here.shape[1]
         at = p.here[rows].mean(axis=1)
-        place = np.empty((len(rows), 3))
-        for name in np.unique(p.vehicle[rows]):
-            own = p.vehicle[rows] == name
-            t, position = ways[str(name)]
-            place[own] = np.stack([np.interp(at[own], t, c) for c in position.T], axis=1)
-        sigma = p.sigma[rows]
+        place = places_on(ways, p.vehicle[rows], at)
+        clock = np.full(len(rows), -1.0)
         if p.kind == "one_way_range":
-            # A range between clocks that may differ says as little as they do.
-            sigma = np.hypot(sigma, [clocks[str(name)] for name in p.vehicle[rows]])
-        columns.append((place, metres * p.measured[rows], metres * sigma, at - epoch))
+            clock[:] = [unknown[str(name)] for name in p.vehicle[rows]]
+        distance, sigma = metres * p.measured[rows], metres * p.sigma[rows]
+        columns.append((place, distance, sigma, at - epoch, clock))
     return _Seen(*(np.concatenate(parts) for parts in zip(*columns, strict=True)))
+
+
+def places_on(ways: Mapping[str, Way], names: FloatArray, times: FloatArray) -> FloatArray:
+    """Where each of some vehicles (M,) was at a time (M,), s: (M, 3), m."""
+    place = np.empty((len(times), 3))
+    for name in np.unique(names):
+        own = names == name
+        t, position = ways[str(name)]
+        place[own] = np.stack([np.interp(times[own], t, c) for c in position.T], axis=1)
+    return place
 
 
 def _begins(target: Target, seen: _Seen) -> FloatArray:
@@ -125,14 +148,21 @@ def _begins(target: Target, seen: _Seen) -> FloatArray:
     if target.position is not None and target.sigma[2] < UNKNOWN_PLACE:
         known = float(target.position[2])
     order = np.argsort(seen.later)
+    timed = order[seen.clock[order] < 0]
+    if len(timed):
+        rows = np.unique(timed[[0, len(timed) // 2, -1]])
+        around = [(int(i), float(seen.distance[i])) for i in rows]
+    else:
+        extent = max(NEAREST, float(np.linalg.norm(np.ptp(seen.place, axis=0))))
+        around = [(int(order[len(order) // 2]), share * extent) for share in SHARES]
     angles = np.linspace(0.0, 2.0 * np.pi, BEARINGS, endpoint=False)
+    circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(BEARINGS)], axis=1)
     out: list[FloatArray] = []
-    for i in np.unique(order[[0, len(order) // 2, -1]]):
-        place, distance = seen.place[i], seen.distance[i]
+    for i, distance in around:
+        place = seen.place[i]
         ups = [known] if known is not None else [place[2], place[2] - 0.5 * distance]
         for up in ups:
             radius = np.sqrt(max(distance**2 - (place[2] - up) ** 2, 1.0))
-            circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(BEARINGS)], axis=1)
             out.append(np.array([place[0], place[1], up]) + radius * circle)
     if target.position is not None:
         out.append(np.asarray(target.position)[None])
@@ -170,7 +200,9 @@ def _descended(target: Target, seen: _Seen, begin: FloatArray, *, robust: bool) 
 
     x = np.concatenate([begin, np.zeros(3)])[free]
     scale = np.where(free < 3, 100.0, 1.0)
-    loss = "cauchy" if robust else "linear"
-    found = least_squares(residuals, x, x_scale=scale, loss=loss, max_nfev=60)
+    # Without a loss first: far from the answer all ranges look like outliers.
+    found = least_squares(residuals, x, x_scale=scale, max_nfev=60)
+    if robust:
+        found = least_squares(residuals, found.x, x_scale=scale, loss="cauchy", max_nfev=60)
     state = whole(found.x)
     return TargetStart(state[:3], state[3:], float(found.cost))
