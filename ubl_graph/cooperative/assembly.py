@@ -74,6 +74,9 @@ def assemble_member(
         return replace(of, x=of.x[place], frozen=of.frozen[blocks])
 
     mine, covariances = local(solution), marginals.vehicle(number)
+    if mine.trouble and marginals.settled(number):
+        # Somebody else is not where they will stay.
+        mine = replace(mine, trouble="")
     chain = member.layout.chains[0]
     rival, track, runner_up = rival_of(own, mine, covariances, [local(r) for r in rivals], chain)
     segment = assemble_segment(
@@ -152,6 +155,8 @@ def assemble_target(
     known = 3 * len(names)
     covariance[:known, :known] = marginals.common(names)
     position = solution.x[place]
+    if solution.trouble and marginals.common_settled(names[0]):
+        solution = replace(solution, trouble="")
     status, reason = _target_status(
         covariance[:3, :3],
         _limit(problem, target.name) or UNOBSERVED_SIGMA,

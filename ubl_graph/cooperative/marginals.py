@@ -15,6 +15,11 @@ from ubl_graph.solve.normal import NormalEquations, Point
 from ubl_graph.solve.rounds import Solution
 
 
+#: A vehicle or target that a full step would move by less than this share of its standard deviation
+#: is where it will stay, whatever the others still do.
+SETTLED = 0.1
+
+
 class FleetMarginals:
     """Covariances of the unknowns of a fleet at a solution.
 
@@ -44,6 +49,21 @@ class FleetMarginals:
             # What a larger ridge lowers, the ridge has made, or rounding has.
             ridge = max(10.0 * self._found.ridge, DOUBTFUL_PIVOT)
             self._larger = _Inverse(equations, point, [ridge], reach)
+        self._step = self._found.step(equations.gradient(point))
+
+    def settled(self, number: int) -> bool:
+        """Whether a full step would leave one vehicle where it is, as far as it is known at all."""
+        layout = self._layout.vehicles[number]
+        own = layout.node_columns("position", np.zeros(1, dtype=np.int64))[0]
+        columns = self._columns(number)[:, own]
+        variance = np.diagonal(self._found.of(columns, columns), axis1=1, axis2=2)
+        return bool((np.abs(self._step[columns]) <= SETTLED * np.sqrt(variance)).all())
+
+    def common_settled(self, name: str) -> bool:
+        """The same of what belongs to no vehicle."""
+        columns = self._layout.common_columns(name)
+        variance = np.diagonal(self._found.border(columns, columns))
+        return bool((np.abs(self._step[columns]) <= SETTLED * np.sqrt(variance)).all())
 
     def vehicle(self, number: int) -> Covariances:
         """Those of one vehicle, by its own layout."""
@@ -90,6 +110,7 @@ class _Inverse:
         self, equations: NormalEquations, point: Point, ridges: Sequence[float], reach: int
     ) -> None:
         factor, self.scale, self.ridge = scaled_factor(equations, point, ridges)
+        self._factor = factor
         pivots = factor.band[0]
         self._inner = factor.band.shape[1]
         self._corner = np.empty((0, 0))
@@ -101,6 +122,10 @@ class _Inverse:
         self.doubtful = self.ridge > 0.0 or float(pivots.min()) ** 2 < DOUBTFUL_PIVOT
         rows = np.zeros((reach - len(factor.band), self._inner))
         self._band = inverse_band(np.concatenate([factor.band, rows]))
+
+    def step(self, gradient: FloatArray) -> FloatArray:
+        """Where a full Gauss-Newton step leads, in scaled columns."""
+        return self._factor.solve(-self.scale * gradient)
 
     def of(self, rows: IntArray, columns: IntArray) -> FloatArray:
         """Blocks (N, R, C) between the nodes' columns `rows` (N, R) and `columns` (N, C)."""
