@@ -66,10 +66,8 @@ class Steps:
         carry = other.backward()
         covariance = carry @ self.covariance @ np.swapaxes(carry, 1, 2) + other.covariance
         if self.planar:
-            cos, sin = np.cos(self.rotation), np.sin(self.rotation)
-            along, aside = other.way.T
-            turned = np.stack([cos * along - sin * aside, sin * along + cos * aside], axis=1)
-            return Steps(self.rotation + other.rotation, self.way + turned, covariance)
+            way = self.way + _turned(self.rotation, other.way)
+            return Steps(self.rotation + other.rotation, way, covariance)
         way = self.way + np.einsum("mij,mj->mi", self.rotation, other.way)
         return Steps(self.rotation @ other.rotation, way, covariance)
 
@@ -236,11 +234,44 @@ def composed(pieces: Steps, group: IntArray) -> Steps:
         In order.
     group : array of int, shape (M,)
         Whose each one is, not decreasing.
+    """
+    return _in_plane(pieces, group) if pieces.planar else _in_pairs(pieces, group)
 
-    Notes
-    -----
-    Neighbours are joined pairwise until one is left: as many passes as the longest group has
-    binary digits.
+
+def _in_plane(pieces: Steps, group: IntArray) -> Steps:
+    """In the plane the poses of all steps in a row are sums: each group is what lies between two.
+
+    A step's noise is seen from its group's end, where all of them add.
+    """
+    opens = np.concatenate([[True], group[1:] != group[:-1]])
+    first = np.flatnonzero(opens)
+    last = np.append(first[1:], len(group)) - 1
+    yaw = np.concatenate([[0.0], np.cumsum(pieces.rotation)])
+    place = np.concatenate([np.zeros((1, 2)), np.cumsum(_turned(yaw[:-1], pieces.way), axis=0)])
+    end = last[np.cumsum(opens) - 1] + 1
+    after = np.arange(len(group)) + 1
+    rest = Steps(
+        yaw[end] - yaw[after], _turned(-yaw[after], place[end] - place[after]), pieces.covariance
+    )
+    carry = rest.backward()
+    seen = carry @ pieces.covariance @ np.swapaxes(carry, 1, 2)
+    turn, way = yaw[last + 1] - yaw[first], _turned(-yaw[first], place[last + 1] - place[first])
+    # What stands alone stays as it is, to the last bit.
+    lone = first == last
+    turn[lone], way[lone] = pieces.rotation[first[lone]], pieces.way[first[lone]]
+    return Steps(turn, way, np.add.reduceat(seen, first, axis=0))
+
+
+def _turned(angle: FloatArray, v: FloatArray) -> FloatArray:
+    """Vectors (M, 2) turned counter-clockwise."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.stack([cos * v[:, 0] - sin * v[:, 1], sin * v[:, 0] + cos * v[:, 1]], axis=1)
+
+
+def _in_pairs(pieces: Steps, group: IntArray) -> Steps:
+    """Neighbours are joined pairwise until one is left of each group.
+
+    As many passes as the longest group has binary digits.
     """
     while True:
         opens = np.concatenate([[True], group[1:] != group[:-1]])

@@ -9,6 +9,7 @@
 """
 
 from ubl_graph.sim.cao2017 import SeaTrial, cao_pass, cao_sea_trial
+from ubl_graph.sim.fleets import random_fleet
 from ubl_graph.sim.missions import (
     DRIFTING,
     PLANAR,
@@ -71,6 +72,7 @@ __all__ = [
     "one_way_pings",
     "planar_vehicle",
     "pressure",
+    "random_fleet",
     "sampled",
     "slant_ranges",
     "straight_pass",
