@@ -75,7 +75,8 @@ def test_what_is_unobservable_is_said_and_written(folder, run):
     text = EXAMPLE["fleet.toml"].replace(
         "[[target]]",
         '[[vehicle]]\nname = "glider"\n[vehicle.options]\nnode = "pose2"\n[vehicle.data]\n'
-        'odometry = "auv-odometry.csv"\n[[vehicle]]\nname = "idle"\n[[target]]\nname = "never"\n[[target]]',
+        'odometry = "auv-odometry.csv"\n[[vehicle]]\nname = "idle"\n'
+        '[[target]]\nname = "never"\n[[target]]',
         1,
     )
     (folder / "fleet.toml").write_text(text)
@@ -92,6 +93,28 @@ def test_what_is_unobservable_is_said_and_written(folder, run):
     assert result["vehicles"]["auv"]["status"] == "converged"
 
 
+@pytest.mark.parametrize("kind", ["a beacon", "one-way ranges"])
+def test_slow_states_of_compounded_vehicles_are_written_at_every_node(folder, run, kind):
+    text, ranges = EXAMPLE["fleet.toml"], EXAMPLE["ranges.csv"]
+    if kind == "a beacon":
+        text += '[[beacon]]\nname = "B1"\nposition = { east = 0.0, north = -100.0, up = -60.0 }\n'
+        ranges += "auv,B1,12,12.2,.2832\nauv,B1,32,32.2,.2200\nauv,B1,52,52.2,.1700\n"
+    else:
+        text = text.replace("two_way_range", "one_way_range")
+        ranges = "\n".join(",".join(r.split(",")[:4]) for r in ranges.splitlines()) + "\n"
+    (folder / "fleet.toml").write_text(text)
+    (folder / "ranges.csv").write_text(ranges)
+    code, _, _ = run("smooth", "fleet.toml", "-o", "out")
+    assert code == 0
+    tables = [
+        (folder / "out" / "auv" / name).read_text().splitlines()
+        for name in ("trajectory.csv", "slow_states.csv")
+    ]
+    assert len(tables[0]) == len(tables[1]) > 5
+    drawn = "sound_speed.png" if kind == "a beacon" else "clock_offset.png"
+    assert drawn in {path.name for path in (folder / "out" / "auv").iterdir()}
+
+
 THIRD = EXAMPLE["ranges.csv"].splitlines()[3]
 BAD = {
     "unknown end": ("ranges.csv", THIRD, THIRD.replace("auv,boat", "auv,baot"), "row 3 (line 4)"),
@@ -99,7 +122,7 @@ BAD = {
     "row error": ("ranges.csv", THIRD, THIRD + "0,1", "row 3 (line 4)"),
     "missing column": ("ranges.csv", "vehicle,peer", "vehicle,other", "'peer' is missing"),
     "missing file": ("fleet.toml", '"ranges.csv"', '"range.csv"', "range.csv"),
-    "clocks hours apart": ("ranges.csv", THIRD, "auv,boat,7245,7245.2,0.2", "differ by hours"),
+    "clocks hours apart": ("ranges.csv", THIRD, "auv,boat,7245,7245.2,0.2", "seem to differ by"),
     "named twice": ("fleet.toml", 'name = "auv"', 'name = "boat"', "'boat' is there twice"),
     "target named as beacon": (
         *("fleet.toml", "[[target]]"),

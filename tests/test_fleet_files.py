@@ -253,7 +253,7 @@ BAD = {
     ),
     "clocks hours apart": (
         *(RANGES, THIRD, "auv,boat,7245,7245.2,0.2", DataError),
-        *("ranges.csv, row 3 (line 4)", "clocks of 'auv' and 'boat' seem to differ by hours"),
+        *("ranges.csv, row 3 (line 4)", "clocks of 'auv' and 'boat' seem to differ by"),
     ),
     "missing file of the fleet": (
         *("fleet.toml", '"ranges.csv"', '"range.csv"', DataError),

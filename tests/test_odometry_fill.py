@@ -14,13 +14,13 @@ from ubl_graph.sim.pose_sensors import odometer
 EVERY = 5
 
 
-def both(node="pose2", **changes):
+def both(node="pose2", spatial=True, **changes):
     """One vehicle's mission smoothed with nodes at all records, and as a fleet of one."""
     options = replace(PLANAR, node=node, loss="none", estimate_sound_speed=False, **changes)
     mission, truth = planar_vehicle(3, options=options, duration=300.0)
     (segment,) = mission.segments
     steps = segment.odometry
-    if node == "pose3":
+    if node == "pose3" and spatial:
         rng = np.random.default_rng(5)
         times = np.append(steps.t_from, steps.t_to[-1])
         steps = odometer(truth, times, rng, options, planar=False)
@@ -67,6 +67,23 @@ def test_the_way_between_nodes_is_that_of_a_graph_with_a_node_at_each_record(nod
     times = np.linspace(1.0, other.t[-1] - 1.0, 57)
     here, there = one.at(times), other.at(times)
     assert np.abs(relative(here.covariance, there.covariance)).max() < share
+
+
+def test_planar_odometry_holds_a_vehicle_in_space_upright_in_a_fleet_too():
+    alone, together = both("pose3", spatial=False)
+    one, other = alone.segments[0].trajectory, together.segments[0].trajectory
+    assert np.allclose(one.position, other.position, atol=1e-4)
+    assert np.abs(relative(one.pose_covariance, other.pose_covariance)).max() < 1e-3
+
+
+def test_slow_states_have_as_many_rows_as_the_trajectory():
+    options = replace(PLANAR, loss="none")
+    mission, _ = planar_vehicle(4, options=options, duration=120.0)
+    segment = replace(mission.segments[0], heading=None)
+    fleet = Fleet((Member("it", segment, options=options),), mission.beacons, options=options)
+    (solved,) = smooth_fleet(fleet).vehicles["it"].segments
+    state = solved.slow["sound_speed"]
+    assert len(state.t) == len(state.value) == len(state.sigma) == len(solved.trajectory.t)
 
 
 def test_records_with_a_gap_leave_the_trajectory_as_it_is():

@@ -82,3 +82,13 @@ def held_up(setup: Setup, segment: Segment, t: FloatArray) -> FloatArray:
     if segment.start is not None and segment.start.up is not None:
         return np.full(len(t), segment.start.up)
     return np.zeros(len(t))
+
+
+def known_up(segment: Segment) -> bool:
+    """Whether anything says at which up a planar vehicle stays (`held_up`)."""
+    fixes, start = segment.position, segment.start
+    return (
+        (segment.depth is not None and len(segment.depth) > 0)
+        or (fixes is not None and len(fixes) > 0 and fixes.up is not None)
+        or (start is not None and start.up is not None)
+    )

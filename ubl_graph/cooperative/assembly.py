@@ -116,8 +116,23 @@ def _filled_in(
     whole = filled_in(track, records, options, errors)
     rival = segment.rival
     if rival is not None:
-        rival = np.stack([np.interp(whole.t, track.t, c) for c in rival.T], axis=1)
-    return replace(segment, trajectory=whole, rival=rival)
+        rival = _resampled(whole.t, track.t, rival)
+    # Between nodes slow states are linear; so is the most that their sigmas can be.
+    slow = {
+        name: replace(
+            s,
+            t=whole.t,
+            value=_resampled(whole.t, track.t, s.value),
+            sigma=_resampled(whole.t, track.t, s.sigma),
+        )
+        for name, s in segment.slow.items()
+    }
+    return replace(segment, trajectory=whole, rival=rival, slow=slow)
+
+
+def _resampled(t: FloatArray, nodes: FloatArray, values: FloatArray) -> FloatArray:
+    """Values at nodes (N, size) at other times (M,), (M, size), linearly."""
+    return np.stack([np.interp(t, nodes, column) for column in values.T], axis=1)
 
 
 def _limit(problem: FleetProblem, name: str) -> float | None:

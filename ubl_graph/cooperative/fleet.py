@@ -162,8 +162,8 @@ class Fleet:
         not go together.
     DataError
         Where a range has an unknown end or the vehicle itself at both, its times lie outside the
-        other's records (clocks that differ by hours), or a record is there twice; it names the
-        record.
+        other's records (clocks that differ by more than ten minutes), or a record is there twice;
+        it names the record.
     """
 
     vehicles: tuple[Member, ...]
@@ -175,6 +175,15 @@ class Fleet:
     origin: GeodeticOrigin | None = None
 
     def __post_init__(self) -> None:
+        given: Any = self.vehicles
+        if not isinstance(given, tuple) or not all(
+            isinstance(v, Member) and isinstance(vars(v)["segment"], Segment) for v in given
+        ):
+            raise ConfigurationError(
+                "vehicles are no tuple of Member with a Segment each",
+                "give (Member(name, segment), ...)",
+                field="vehicle",
+            )
         if not self.vehicles:
             raise ConfigurationError("the fleet has no vehicle", field="vehicle")
         check_names(self.beacons)
@@ -258,7 +267,7 @@ class Fleet:
         return replace(member.options, **{name: getattr(self.options, name) for name in whole})
 
     def _check_names(self) -> None:
-        names = self.names
+        names: tuple[Any, ...] = self.names
         for name in names:
             if names.count(name) > 1:
                 raise ConfigurationError(
@@ -266,8 +275,10 @@ class Fleet:
                     "vehicles, beacons and targets are told apart by their names",
                     field="name",
                 )
-            if not name:
-                raise ConfigurationError("a vehicle or target without a name", field="name")
+            if not isinstance(name, str) or not name:
+                raise ConfigurationError(
+                    f"{name!r} is no name", "give a text that is not empty", field="name"
+                )
 
     def _check_ends(self, member: Member) -> None:
         """Refuse ranges to the vehicle itself and to what is not there."""
@@ -313,6 +324,7 @@ class Fleet:
                     late = times[rows].max(axis=1) > span[1] + EPOCH_SLACK
                     if (early | late).any():
                         i = int(rows[np.argmax(early | late)])
+                        gap = max(span[0] - times[i].min(), times[i].max() - span[1])
                         differ = f"the clocks of '{member.name}' and '{name}' seem to differ"
                         if str(name) not in spans:
                             differ = f"the clocks of the ranges to '{name}' and of these differ"
@@ -320,7 +332,7 @@ class Fleet:
                             i,
                             "t" if hasattr(pings, "t") else "t_receive",
                             f"{times[i, -1]} s: vehicle '{who}' has records from {span[0]} to "
-                            f"{span[1]} s only, so {differ} by hours",
+                            f"{span[1]} s only, so {differ} by {gap:.0f} s",
                             "bring all vehicles' stamps to one epoch",
                         )
 

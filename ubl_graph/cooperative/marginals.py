@@ -14,7 +14,6 @@ from ubl_graph.solve.marginals import DOUBTFUL_PIVOT, RIDGES, Covariances, scale
 from ubl_graph.solve.normal import NormalEquations, Point
 from ubl_graph.solve.rounds import Solution
 
-
 #: A vehicle or target that a full step would move by less than this share of its standard deviation
 #: is where it will stay, whatever the others still do.
 SETTLED = 0.1

@@ -146,7 +146,10 @@ def _compoundable(segment: Segment, options: Options) -> bool:
     if options.node == "pose3":
         others.add("depth")
     present = segment.records().keys()
-    return "odometry" in present and not others & present
+    if segment.odometry is None or "odometry" not in present or others & present:
+        return False
+    # What holds a vehicle in space upright, where its odometry is planar, stands at each node.
+    return options.node != "pose3" or segment.odometry.dimension == 3
 
 
 def _wanted(view: Segment, options: Options) -> FloatArray:

@@ -29,6 +29,7 @@ from ubl_graph.cooperative.starts import find_fleet_starts, reckons, with_clocks
 from ubl_graph.cooperative.targets import TargetStart, target_starts
 from ubl_graph.initial import Starts
 from ubl_graph.layout import Layout
+from ubl_graph.pose_states import known_up
 from ubl_graph.result import DOWN_WEIGHTED, Result, Shared
 from ubl_graph.smoother import DOUBTFUL_SHARE, SAME_COST, SUSPICIOUS_CHI_SQUARE, SUSPICIOUS_SHARE
 from ubl_graph.solve.choice import choose
@@ -36,6 +37,8 @@ from ubl_graph.solve.rounds import Solution, graduated
 from ubl_graph.track import Track, start_vector
 from ubl_graph.work import Progress, Work, confirmed, down_weighted
 
+#: What lies within this of up 0 is in the plane of vehicles of which nothing else is said, m.
+LEVEL = 1.0
 #: So many further tracks of a vehicle, and places of a target, are solved in full.
 MOST_RIVALS = 2
 #: Unknowns that belong to no node which the banded solver takes for a fleet.
@@ -177,6 +180,7 @@ def _smooth_group(work: Work, fleet: Fleet, number: int) -> _Part:
         residuals = assemble_residuals(problem, best)
     for name, result in vehicles.items():
         _judge(work, name, result, residuals)
+        _judge_depth(work, fleet, name)
     return _Part(vehicles, targets, residuals, shared)
 
 
@@ -270,4 +274,20 @@ def _judge(work: Work, name: str, result: Result, residuals: FleetResiduals | No
             name,
             f"chi-square per degree of freedom is {ratio:.1f} for the vehicles that are solved "
             "with it: the data contradict each other or their sigmas are too small",
+        )
+
+
+def _judge_depth(work: Work, fleet: Fleet, name: str) -> None:
+    """Warn where a planar vehicle is held at up 0 among what lies elsewhere."""
+    member = fleet.member(name)
+    if member.options.node != "pose2" or known_up(member.segment):
+        return
+    ups = [float(b.position[2]) for b in fleet.beacons]
+    ups += [float(t.position[2]) for t in fleet.targets if t.position is not None]
+    deep = any(known_up(v.segment) or v.options.node != "pose2" for v in fleet.vehicles)
+    if deep or any(abs(up) > LEVEL for up in ups):
+        work.warn(
+            name,
+            "it moves in a plane and nothing says how deep that is: it is held at up 0 m; give the "
+            "start an up, or depths",
         )
