@@ -6,8 +6,15 @@ import numpy as np
 import pytest
 
 from ubl_graph.cooperative.fleet import Fleet, Member, Target
-from ubl_graph.errors import DataError, SolverError, TimeError, UblGraphError
+from ubl_graph.errors import (
+    ConfigurationError,
+    DataError,
+    SolverError,
+    TimeError,
+    UblGraphError,
+)
 from ubl_graph.measurements import (
+    Depth,
     Heading,
     Odometry,
     OneWayRange,
@@ -17,6 +24,7 @@ from ubl_graph.measurements import (
     Velocity,
 )
 from ubl_graph.online.fleet_estimator import FleetEstimator
+from ubl_graph.online.fleet_finder import Seen, known_of, target_residuals
 from ubl_graph.online.fleet_replay import bare, stream
 from ubl_graph.online.fleet_system import System
 from ubl_graph.options import Options
@@ -394,3 +402,282 @@ def test_clocks_that_differ_by_seconds_are_learned():
         off = (estimate.position - [places[i, 0], places[i, 1] + north[i], 0.0])[:2]
         # Stamps that are seconds off place the nodes where the vehicle was then.
         assert np.linalg.norm(off) < 6.0
+
+
+#: How far a wrong clock is ahead, s.
+WRONG = 7200.0
+
+
+def pair(more=(), targets=(), node="pose2"):
+    """A boat that goes east at 1.5 m/s and a vehicle 50 m deep that goes north; others beside."""
+    starts = {
+        "boat": Start(0.0, 0.0, 0.0, 0.0, 1.0, np.pi / 2, 0.01),
+        "auv": Start(0.0, 100.0, -200.0, -50.0, 5.0, 0.0, 0.01),
+    }
+    for name in more:
+        starts[name] = Start(0.0, 0.0, 300.0, 0.0, 1.0, np.pi / 2, 0.01)
+    options = Options(node=node)
+    members = (Member(n, Segment(start=s), options=options) for n, s in starts.items())
+    return FleetEstimator(Fleet(tuple(members), targets=targets, options=options), lag=120.0)
+
+
+def sail(estimator, begin, end, shift=None, order=("boat", "auv"), at=None):
+    """Odometry every second, fixes of the boat and ranges to it every ten; all outcomes."""
+    shift, out = shift or {}, {name: [] for name in order}
+    for t in np.arange(begin, end + 1.0):
+        boat, auv = np.array([1.5 * t, 0.0, 0.0]), np.array([100.0, 1.5 * t - 200.0, -50.0])
+        for name in order:
+            own = t + shift.get(name, 0.0)
+            step = Odometry(own - 1.0, own, 1.5, 0.0, about_down=0.0)
+            out[name].append(estimator.add(name, step))
+            if t % 10 == 0 and name == "boat":
+                out[name].append(estimator.add(name, PositionFix(own, *boat, sigma=1.0)))
+            if t % 10 == 0 and name == "auv":
+                length = np.linalg.norm(boat - auv)
+                out[name].append(estimator.add(name, SlantRange(own, "boat", length)))
+        if at is not None:
+            at(t)
+        if t % 10 == 0:
+            estimator.update()
+    return out
+
+
+def test_a_clock_that_jumps_ahead_leaves_out_its_vehicle_alone():
+    estimator, clean = pair(), pair()
+    sail(estimator, 1, 120)
+    out = sail(estimator, 121, 240, {"auv": WRONG})
+    sail(clean, 1, 240)
+    assert all(o.accepted for o in out["boat"])
+    assert not any(o.accepted for o in out["auv"])
+    assert out["auv"][-1].reason == "its clock is 7200 s ahead of the others'"
+    assert estimator.core.now == 240.0
+    boat = estimator.estimate("boat")
+    assert boat.status == "ok"
+    np.testing.assert_allclose(boat.position, clean.estimate("boat").position, atol=0.5)
+    auv = estimator.estimate("auv", 240.0)
+    assert auv.status != "ok"
+    assert any("ahead of the others'" in reason for reason in auv.reasons)
+    rejected = estimator.health()["vehicles"]["auv"]["sensors"]["odometry"]["rejected"]
+    assert rejected == {"ahead": 120}
+    # The clock is set right: all is well again, and nothing is said of it any more.
+    sail(estimator, 241, 300)
+    auv = estimator.estimate("auv", 300.0)
+    assert not any("clock" in reason for reason in auv.reasons)
+    assert np.linalg.norm((auv.position - [100.0, 250.0, -50.0])[:2]) < 10.0
+
+
+@pytest.mark.parametrize("order", [("boat", "auv"), ("auv", "boat")])
+def test_a_clock_that_is_ahead_from_the_first_record_on(order):
+    estimator = pair()
+    out = sail(estimator, 1, 120, {"auv": WRONG}, order)
+    # The first three may have to win against the one that came before.
+    assert all(o.accepted for o in out["boat"][2:])
+    assert estimator.core.now == 120.0
+    boat = estimator.estimate("boat")
+    assert boat.status == "ok"
+    np.testing.assert_allclose(boat.position[:2], [180.0, 0.0], atol=1.0)
+    assert "ahead of the others'" in " ".join(estimator.estimate("auv", 120.0).reasons)
+
+
+def test_two_vehicles_win_against_one_that_has_long_gone_on_with_a_wrong_clock():
+    estimator = pair(("ship",))
+    sail(estimator, 1, 300, {"auv": WRONG}, ("auv",))
+    assert estimator.core.now == WRONG + 300.0
+    late = estimator.add("boat", Odometry(300.0, 301.0, 1.5, 0.0, about_down=0.0))
+    assert not late.accepted
+    assert estimator.add("ship", Odometry(300.0, 301.0, 1.5, 0.0, about_down=0.0)).accepted
+    assert estimator.core.now == 301.0
+    assert len(estimator.core.lines["boat"].pieces) == 1
+    out = sail(estimator, 302, 400, {"auv": WRONG})
+    assert all(o.accepted for o in out["boat"])
+    assert estimator.core.now == 400.0
+
+
+def test_one_vehicle_does_not_win_against_one_that_has_long_gone_on():
+    estimator = pair()
+    sail(estimator, 1, 300, {"auv": WRONG}, ("auv",))
+    out = sail(estimator, 1, 300, order=("boat",))
+    assert not any(o.accepted for o in out["boat"])
+    assert estimator.core.now == WRONG + 300.0
+
+
+def test_two_vehicles_agree_on_a_later_time():
+    estimator = pair(("ship",))
+    sail(estimator, 1, 60)
+    out = sail(estimator, 601, 620, order=("auv", "boat"))
+    assert [o.accepted for o in (out["auv"] + out["boat"])].count(False) == 2
+    assert estimator.core.now == 620.0
+
+
+def test_a_vehicle_is_believed_where_there_is_but_one_or_the_others_are_silent():
+    options = Options(node="pose2")
+    start = Start(0.0, 0.0, 0.0, 0.0, 1.0, np.pi / 2, 0.01)
+    one = Fleet((Member("boat", Segment(start=start), options=options),), options=options)
+    alone = FleetEstimator(one, lag=120.0)
+    sail(alone, 1, 10, order=("boat",))
+    assert [o.accepted for o in sail(alone, 1001, 1004, order=("boat",))["boat"]] == [
+        False,
+        False,
+        True,
+        True,
+    ]
+    estimator = pair()
+    sail(estimator, 1, 60)
+    out = sail(estimator, 601, 800, order=("auv",))["auv"]
+    believed = [o.accepted for o in out]
+    assert not any(believed[:120])
+    assert all(believed[140:])
+    assert not any("clock" in reason for reason in estimator.estimate("auv").reasons)
+
+
+def test_a_wrong_clock_does_not_take_over_while_the_others_are_silent():
+    estimator = pair()
+    sail(estimator, 1, 150, {"auv": WRONG})
+    assert not any(o.accepted for o in sail(estimator, 151, 400, {"auv": WRONG}, ("auv",))["auv"])
+    assert estimator.core.now == 150.0
+    # Nor does it speak against those who come back.
+    out = sail(estimator, 401, 450, {"auv": WRONG})
+    assert all(o.accepted for o in out["boat"][2:])
+    assert not any(o.accepted for o in out["auv"])
+    assert estimator.core.now == 450.0
+
+
+def test_one_batch_of_odometry_does_not_make_a_wrong_clock_right():
+    estimator = pair()
+    sail(estimator, 1, 60)
+    t = np.arange(WRONG, WRONG + 300.0)
+    same = np.full(len(t), 1.5)
+    zero = np.zeros(len(t))
+    assert not estimator.add("auv", Odometry(t, t + 1.0, same, zero, about_down=zero)).accepted
+    assert all(o.accepted for o in sail(estimator, 61, 90, order=("boat",))["boat"])
+    assert estimator.core.now == 90.0
+
+
+def test_a_fix_that_is_refused_does_not_move_the_depth():
+    def bad(t):
+        if t == 150.0:
+            estimator.add("auv", PositionFix(t - 0.5, 5000.0, 5000.0, 400.0, sigma=1.0))
+
+    estimator, clean = pair(), pair()
+    sail(estimator, 1, 240, at=bad)
+    sail(clean, 1, 240)
+    sensors = estimator.health()["vehicles"]["auv"]["sensors"]
+    assert sensors["position"]["rejected"] == {"gated": 1}
+    assert sensors["slant_range"]["rejected"] == {}
+    np.testing.assert_allclose(
+        estimator.estimate("auv").position, clean.estimate("auv").position, atol=1e-6
+    )
+
+
+def test_a_fix_that_is_accepted_says_the_depth_of_ranges_that_come_with_it():
+    """The vehicle has dived to 80 m since its start; only a fix knows."""
+    estimator = pair()
+    sail(estimator, 1, 39, order=("boat",))
+    for t in range(39):
+        estimator.add("auv", Odometry(t, t + 1.0, 1.5, 0.0, about_down=0.0))
+    boat, auv = np.array([58.5, 0.0, 0.0]), np.array([100.0, -141.5, -80.0])
+    estimator.add("auv", PositionFix(39.0, *auv, sigma=0.5))
+    estimator.add("boat", PositionFix(39.0, *boat, sigma=0.5))
+    estimator.add("auv", SlantRange(39.0, "boat", np.linalg.norm(boat - auv), 0.2))
+    assert estimator.update() == ()
+    np.testing.assert_allclose(estimator.estimate("auv").position, auv, atol=0.5)
+
+
+@pytest.mark.parametrize("node", ["pose2", "pose3"])
+def test_one_wrong_depth_is_refused(node):
+    outcomes = {}
+
+    def depths(t):
+        if t % 5 == 0:
+            outcomes[t] = estimator.add("auv", Depth(t, 450.0 if t == 150.0 else 50.0, 0.1))
+
+    estimator = pair(node=node)
+    sail(estimator, 1, 200, at=depths)
+    assert [t for t, o in outcomes.items() if not o.accepted] == [150.0]
+    assert "from the depth" in outcomes[150.0].reason
+    sensors = estimator.health()["vehicles"]["auv"]["sensors"]
+    assert sensors["depth"]["rejected"] == {"gated": 1}
+    assert sensors["slant_range"]["rejected"] == {}
+    np.testing.assert_allclose(estimator.smoothed("auv", 150.0).position[2], -50.0, atol=0.5)
+
+
+def test_a_depth_that_persists_is_let_in_again():
+    estimator = pair()
+    sail(estimator, 1, 10)
+    said = [(10.0, 450.0), (11.0, 50.0), (12.0, 50.1), (13.0, 50.2), (14.0, 50.1)]
+    out = [estimator.add("auv", Depth(t, depth, 0.1)).accepted for t, depth in said]
+    assert out == [True, False, False, True, True]
+    # The one that began was outvoted, and nothing remembers it.
+    estimator.add("auv", Odometry(13.0, 14.0, 1.5, 0.0, about_down=0.0))
+    estimator.update()
+    np.testing.assert_allclose(estimator.estimate("auv", 14.0).position[2], -50.1)
+    sensors = estimator.health()["vehicles"]["auv"]["sensors"]
+    assert sensors["depth"]["accepted"] == 5
+    assert sensors["depth"]["rejected"].get("gated", 0) == 0
+
+
+def test_wrong_depths_among_right_ones_do_not_add_up():
+    estimator = pair()
+    out = [
+        estimator.add("auv", Depth(0.5 * k, 450.0 if k % 2 else 50.0, 0.1)).accepted
+        for k in range(20)
+    ]
+    assert out == [True, False] * 10
+
+
+def test_batches_of_nothing_are_nothing(settled):
+    none = np.empty(0)
+    before = said(settled)
+    for records in (SlantRange(none, "V1", none), Odometry(none, none, none, none)):
+        assert settled.add("V0", records).accepted
+    settled.update()
+    np.testing.assert_array_equal(said(settled), before)
+
+
+@pytest.mark.parametrize("wrong", ["3", None, [3.0]])
+def test_what_is_no_number_is_told_so(settled, wrong):
+    with pytest.raises(ConfigurationError, match="lag"):
+        FleetEstimator(settled.fleet, lag=wrong)
+    with pytest.raises(TimeError):
+        settled.smoothed("V0", wrong)
+    if wrong is not None:
+        with pytest.raises(TimeError):
+            settled.estimate("V0", wrong)
+        with pytest.raises(DataError, match="unknown vehicle"):
+            settled.estimate(wrong)
+
+
+def carried(target, epoch):
+    """Covariance of position and velocity at a time, from those stated: E of products, by hand."""
+    dt = epoch - target.t
+    place, motion = np.diag(target.sigma**2), np.diag(target.velocity_sigma**2)
+    return np.block([[place + dt**2 * motion, dt * motion], [dt * motion, motion]])
+
+
+def test_a_moving_targets_place_and_velocity_are_known_jointly():
+    target = Target("T", [10.0, 20.0, -5.0], [3.0, 4.0, 0.5], [0.2, 0.3, 0.1], t=100.0)
+    seen = [Seen(350.0, np.zeros(3), 0.0, 30.0, 1.0)]
+    mean, _, _ = known_of(target, 400.0)
+    np.testing.assert_allclose(mean, [10.0, 20.0, -5.0, 0.0, 0.0, 0.0])
+    residuals = target_residuals(target, seen, 400.0)
+    at = residuals(mean[None])[0, 1:]
+    np.testing.assert_allclose(at, 0.0, atol=1e-12)
+    slope = (residuals(mean + np.eye(6))[:, 1:] - at).T
+    covariance = np.linalg.inv(slope.T @ slope)
+    np.testing.assert_allclose(covariance, carried(target, 400.0), rtol=1e-9, atol=1e-9)
+
+
+def test_a_moving_targets_prior_in_the_window_is_joint():
+    """Ranges that say next to nothing leave what was known, carried to the window's epoch."""
+    target = Target("T", [150.0, 50.0, -5.0], [3.0, 4.0, 0.5], [0.1, 0.2, 0.05], t=-100.0)
+    estimator = pair(targets=(target,))
+    sail(estimator, 1, 20)
+    for t in (18.0, 19.0, 20.0):
+        estimator.add("boat", SlantRange(t, "T", 130.0, 1e4))
+    estimator.update()
+    estimator.update()
+    fix = estimator.target("T")
+    assert fix.status == "ok"
+    expected = carried(target, estimator.core.now)
+    np.testing.assert_allclose(fix.covariance, expected[:3, :3], rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(fix.velocity_covariance, expected[3:, 3:], rtol=1e-3, atol=1e-5)

@@ -126,9 +126,8 @@ def _bridges(trajectory: PoseTrajectory, steps: Steps, interval: IntArray) -> _B
     whole = prefix[last[interval]]
     back, back_whole = prefix.backward(), whole.backward()
     seen = back_whole @ np.asarray(np.linalg.inv(back), np.float64)
-    gain: FloatArray = np.swapaxes(
-        np.linalg.solve(whole.covariance, seen @ prefix.covariance), 1, 2
-    )
+    told = np.asarray(np.linalg.solve(whole.covariance, seen @ prefix.covariance), np.float64)
+    gain = np.swapaxes(told, 1, 2)
     own = prefix.covariance - gain @ seen @ prefix.covariance
     onward = np.zeros_like(own)
     carried = prefix.covariance[:-1] @ np.swapaxes(steps.backward()[1:], 1, 2)

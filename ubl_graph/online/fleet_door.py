@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import difflib
 import math
+from collections.abc import Sequence
 from dataclasses import fields
+from numbers import Real
 
 import numpy as np
 
@@ -28,7 +30,8 @@ from ubl_graph.records import Records
 
 #: Kinds of records that are taken.
 TAKEN = (Odometry, PositionFix, Heading, Depth, TwoWayRange, OneWayRange, SlantRange)
-#: Records that are farther ahead of all others than the lag count once so many agree.
+#: Records that are farther ahead of all others than the lag count once so many agree, of two
+#: vehicles at the least.
 AGREED = 3
 #: Records that are held back at the most.
 MOST_HELD = 100
@@ -53,10 +56,32 @@ class Door:
     core: Core
 
     def __init__(self, fleet: Fleet, lag: float) -> None:
+        if not isinstance(lag, Real) or not math.isfinite(lag) or lag <= 0.0:
+            raise ConfigurationError(f"a lag of {lag!r} s", "give seconds, more than zero")
         self.fleet, self.lag = fleet, float(lag)
         self._check_fleet()
         self._names = frozenset(fleet.names)
+        self._forget_clocks()
+
+    def _begin(self) -> None:
+        """Forget all records; begin anew from the starts."""
+        raise NotImplementedError
+
+    def _forget_clocks(self) -> None:
+        """Nothing has been heard."""
+        #: Records that are held back.
         self._held: list[tuple[str, Entry]] = []
+        #: Records that are far behind the only vehicle that has been believed.
+        self._behind: list[tuple[str, Entry]] = []
+        #: Vehicles of which a record was believed, and the first stamp of all.
+        self._believed: set[str] = set()
+        self._first = math.inf
+        #: By vehicle, how far its clock is ahead of the others', s.
+        self._ahead: dict[str, float] = {}
+        #: Those of them that others have contradicted: they have no say till they are right.
+        self._wrong: set[str] = set()
+        #: Who spoke last, its first stamp that was held back since another did, and calls since.
+        self._speaker, self._alone, self._calls = "", math.inf, 0
 
     def add(self, vehicle: str, records: Records) -> Outcome:
         """Take records of a vehicle in. Odometry is kept; the rest counts from the next `update`.
@@ -80,6 +105,15 @@ class Door:
             kind is none that is taken; the estimate is untouched.
         """
         self._check(vehicle, records)
+        if not len(records):
+            return Outcome(True)
+        if vehicle not in self._wrong:
+            if vehicle != self._speaker:
+                self._speaker, self._alone, self._calls = vehicle, math.inf, 0
+            self._calls += math.isfinite(self._alone)
+        return self._add(vehicle, records)
+
+    def _add(self, vehicle: str, records: Records) -> Outcome:
         if isinstance(records, Odometry):
             return self._add_odometry(vehicle, records)
         outcome = Outcome(True)
@@ -97,6 +131,11 @@ class Door:
         begin = max(core.horizon, line.nodes[0].t if line.nodes else -math.inf)
         late, ahead = records.t_to <= begin, self._leaps(records)
         reason = ""
+        if records.t_to[-1] <= core.horizon:
+            last = records[max(len(records) - AGREED, 0) :]
+            entries = [entry_of(last[i]) for i in range(len(last))]
+            if self._outvotes(vehicle, entries):
+                return self._add_odometry(vehicle, records)
         if late.any():
             gate.rejected["late"] += int(late.sum())
             reason = self._too_old(float(records.t_to[late].min()))
@@ -109,19 +148,21 @@ class Door:
                 else:
                     gate.accepted += 1
                     gate.times.append(t)
-            self._advance(float(now.t_to[-1]))
-        final = True
+            self._advance(vehicle, float(now.t_to[0]), float(now.t_to[-1]))
+        held, final = "", True
         for i in np.flatnonzero(ahead).tolist():
+            if core.now is not None and records.t_to[i] <= core.now + self.lag:
+                # Those before it agreed.
+                outcome = self._add_odometry(vehicle, records[i:])
+                held, final = outcome.reason, outcome.final
+                break
             outcome = self._hold(vehicle, entry_of(records[i]))
-            final &= outcome.final
-            reason = outcome.reason or reason
-        return Outcome(not reason, reason, final)
+            held, final = outcome.reason, outcome.final
+        return Outcome(not (held or reason), held or reason, final)
 
     def _leaps(self, records: Odometry) -> BoolArray:
         """Which records, in order of time, are more than the lag ahead of all before them."""
-        now = self.core.now
-        if now is None:
-            return np.zeros(len(records), dtype=np.bool_)
+        now = float(records.t_to[0]) if self.core.now is None else self.core.now
         reached = np.maximum.accumulate(np.append(now, records.t_to[:-1]))
         leaps: BoolArray = records.t_to > reached + self.lag
         return np.logical_or.accumulate(leaps)
@@ -137,6 +178,8 @@ class Door:
         if core.now is not None and entry.t > core.now + self.lag:
             return self._hold(vehicle, entry)
         if core.now is not None and entry.begin < core.horizon:
+            if entry.t < core.horizon and self._outvotes(vehicle, [entry]):
+                return self._admit(vehicle, entry)
             gate.rejected["late"] += 1
             return Outcome(False, self._too_old(entry.begin))
         line = core.lines[vehicle]
@@ -150,25 +193,31 @@ class Door:
             same = twin.equals(entry)
             return Outcome(False, "duplicate" if same else "another record of that time is there")
         core.keys[key] = entry
-        self._advance(entry.t)
+        self._advance(vehicle, entry.t, entry.t)
         if entry.kind == "depth":
-            gate.accept(entry)
-            core.take_up(line, entry.t, -entry.values[1], entry.values[2])
-            return Outcome(True)
-        if entry.kind == "position" and entry.values[1].shape[1] == 3 and line.planar:
-            core.take_up(line, entry.t, float(entry.values[1][0, 2]), None)
+            why = core.take_depth(line, gate, entry)
+            return Outcome(not why, why, not why)
+        full = entry.kind == "position" and entry.values[1].shape[1] == 3
+        if full and line.planar and not line.located:
+            # Nothing can judge the fix yet; the search needs its height.
+            line.take_up(entry.t, float(entry.values[1][0, 2]))
         core.queue.append((vehicle, entry))
         return Outcome(True)
 
     def _hold(self, vehicle: str, entry: Entry) -> Outcome:
         """Keep a record that is far ahead until others agree."""
+        if vehicle == self._speaker:
+            self._alone = min(self._alone, entry.t)
         self._held.append((vehicle, entry))
         del self._held[:-MOST_HELD]
         near = [one for one in self._held if abs(one[1].t - entry.t) <= self.lag]
-        if len(near) < AGREED:
+        if not self._agree(vehicle, entry, near):
             self.core.gates[vehicle][entry.kind].rejected["ahead"] += 1
-            now = self.core.now or 0.0
-            return Outcome(False, f"held back: {entry.t - now:.0f} s ahead of all others", False)
+            off = entry.t - (self.core.now or 0.0)
+            if vehicle in self._ahead or len(near) >= AGREED:
+                self._ahead[vehicle] = off
+                return Outcome(False, f"its clock is {off:.0f} s ahead of the others'", False)
+            return Outcome(False, f"held back: {off:.0f} s ahead of all others", False)
         for name, one in near:
             if one is not entry:
                 self.core.gates[name][one.kind].rejected["ahead"] -= 1
@@ -176,18 +225,64 @@ class Door:
         self.core.now = max(one.t for _, one in near)
         for name, one in sorted(near, key=lambda pair: pair[1].t):
             assert isinstance(one.record, Records)
-            self.add(name, one.record)
+            self._add(name, one.record)
         return Outcome(True)
 
-    def _advance(self, t: float) -> None:
+    def _agree(self, vehicle: str, entry: Entry, near: Sequence[tuple[str, Entry]]) -> bool:
+        """Whether records that are far ahead are believed: one clock alone is not."""
+        if len(near) < AGREED:
+            return False
+        if len({name for name, _ in near}) > 1:
+            return True
+        if vehicle in self._wrong:
+            return False
+        if (self._believed | {name for name, _ in self._held}) - self._wrong == {vehicle}:
+            return True
+        # The others are silent, and it has gone on alone for longer than the lag.
+        return entry.t - self._alone > self.lag and self._calls >= AGREED
+
+    def _outvotes(self, vehicle: str, entries: Sequence[Entry]) -> bool:
+        """Whether records that are far behind show that the only clock believed is ahead.
+
+        Two vehicles do; one does with so many records as agree, unless the other has gone on for
+        longer than the lag. All is begun anew from them then.
+        """
+        if len(self._believed) != 1 or vehicle in self._believed:
+            return False
+        own = [(vehicle, entry) for entry in entries]
+        near = [one for one in self._behind if abs(one[1].t - entries[-1].t) <= self.lag]
+        together = [*near, *own]
+        now = self.core.now or 0.0
+        young = now - self._first <= self.lag
+        if len({name for name, _ in together}) < 2 and not (young and len(together) >= AGREED):
+            self._behind = [*self._behind, *own][-MOST_HELD:]
+            return False
+        (wrong,) = self._believed
+        self._begin()
+        self._ahead[wrong] = now - entries[-1].t
+        self._wrong.add(wrong)
+        for name, one in sorted(near, key=lambda pair: pair[1].t):
+            assert isinstance(one.record, Records)
+            self._add(name, one.record)
+        return True
+
+    def _advance(self, vehicle: str, begin: float, t: float) -> None:
+        """Note that records of a vehicle, of a time span (s), are believed."""
+        self._believed.add(vehicle)
+        self._alone, self._calls = math.inf, 0
+        self._first = min(self._first, begin)
+        self._ahead.pop(vehicle, None)
+        self._wrong = set(self._ahead)
+        if len(self._believed) > 1:
+            self._behind.clear()
         if self.core.now is None or t > self.core.now:
             if self.core.now is None:
                 self.core.window.epoch = t
             self.core.now = t
 
-    def _check_vehicle(self, vehicle: str) -> None:
-        if vehicle not in self.core.lines:
-            raise unknown("vehicle", vehicle, self.fleet.vehicle_names)
+    def _check_vehicle(self, vehicle: object) -> None:
+        if vehicle not in self.fleet.vehicle_names:
+            raise unknown("vehicle", str(vehicle), self.fleet.vehicle_names)
 
     def _check(self, vehicle: str, records: Records) -> None:
         self._check_vehicle(vehicle)
@@ -196,7 +291,8 @@ class Door:
                 f"{type(records).__name__} is nothing that vehicles joined by odometry take",
                 "give Odometry, PositionFix, Heading, Depth or ranges; batch smoothing takes more",
             )
-        for f in fields(records):
+        # No rows have no shape to be looked at by.
+        for f in fields(records) if len(records) else ():
             column = getattr(records, f.name)
             # Records that were made without checks are no excuse.
             if isinstance(column, np.ndarray) and column.dtype.kind == "f":
@@ -220,8 +316,6 @@ class Door:
                 raise records.error(i, "beacon", str(unknown("end", peer, self.fleet.names)))
 
     def _check_fleet(self) -> None:
-        if not math.isfinite(self.lag) or self.lag <= 0.0:
-            raise ConfigurationError(f"a lag of {self.lag} s", "give seconds, more than zero")
         batch = "batch smoothing (smooth_fleet) takes it"
         kinds = {m.options.node for m in self.fleet.vehicles}
         if "point" in kinds or len(kinds) > 1:

@@ -8,6 +8,7 @@ error or an outcome that says why, a solver that fails is begun anew from what t
 from __future__ import annotations
 
 import math
+from numbers import Real
 from time import perf_counter
 from typing import Any
 
@@ -66,10 +67,17 @@ class FleetEstimator(Door):
     against the beacons' common clock.
 
     A gap in the odometry is bridged by the last twist, with the noise of the options' motion prior
-    (`acceleration_psd`, `angular_acceleration_psd`). A record that is farther ahead of all others
-    than the lag is held back until three agree: one wrong stamp does not empty the window. A clock
-    that is set back is not followed: its records are refused as late and counted; `reset` begins
-    anew.
+    (`acceleration_psd`, `angular_acceleration_psd`).
+
+    A record that is farther ahead of all others than the lag is held back until three agree: one
+    wrong stamp does not empty the window. They must be of two vehicles, unless there is but one or
+    the others fall silent: a vehicle whose clock is ahead is left out until it is right, and its
+    estimate says so. Where the first vehicle heard was ahead, all is begun anew from the others
+    once these contradict it. A clock that is set back is not followed: its records are refused as
+    late and counted; `reset` begins anew.
+
+    A depth that would need more than 10 m/s up or down is refused until three in a row agree. The
+    height of a fix counts for a planar vehicle without depths, once the fix is accepted.
 
     The equations have a few hundred columns: one thread solves them fastest
     (`OPENBLAS_NUM_THREADS=1`).
@@ -103,7 +111,7 @@ class FleetEstimator(Door):
     def _begin(self) -> None:
         self.core = Core(self.fleet, self.lag)
         self.finding = Finding(self.core)
-        self._held = []
+        self._forget_clocks()
         self._notes: dict[str, dict[str, float]] = {name: {} for name in self.core.lines}
         self._rebuilt: set[str] = set()
         self.rebuilds = 0
@@ -213,14 +221,15 @@ class FleetEstimator(Door):
         moment = self._moment(vehicle, stamp)
         covariance = None if moment is None else moment.covariance
         core = self.core
+        clock = self._clock(vehicle)
         facts = Facts(
             stamp,
             moment is not None,
             vehicle in self._rebuilt,
-            self.finding.lost.get(vehicle, "") if moment is None else "",
+            self.finding.lost.get(vehicle, clock) if moment is None else "",
             self.finding.ambiguous.get(vehicle, "") if moment is None else "",
             -math.inf,
-            self._notes[vehicle],
+            {**self._notes[vehicle], **({clock: math.inf} if clock else {})},
             0.0 if moment is None else self._reach(vehicle, moment.position),
             0.0,
         )
@@ -258,7 +267,7 @@ class FleetEstimator(Door):
         """
         self._check_vehicle(vehicle)
         line = self.core.lines[vehicle]
-        moment = self._moment(vehicle, t) if math.isfinite(t) else None
+        moment = self._moment(vehicle, t) if math.isfinite(_seconds(t)) else None
         if moment is None or t < line.nodes[0].t - 1e-6:
             raise TimeError(f"'{vehicle}' has no place at {t:g} s in the window")
         return SmoothedPose.of(moment)
@@ -318,6 +327,11 @@ class FleetEstimator(Door):
 
     # -- inside --
 
+    def _clock(self, vehicle: str) -> str:
+        """What is wrong with a vehicle's clock; empty where nothing is known to be."""
+        off = self._ahead.get(vehicle)
+        return "" if off is None else f"its clock is {off:.0f} s ahead of the others'"
+
     def _moment(self, vehicle: str, t: float) -> PoseMoment | None:
         if not self.core.lines[vehicle].located:
             return None
@@ -355,7 +369,7 @@ class FleetEstimator(Door):
             if times[0] is None:
                 raise TimeError("there is no record yet; give a time, or add records first")
             t = max(one for one in times if one is not None)
-        if not math.isfinite(t) or abs(t) > MAX_TIME:
+        if not math.isfinite(_seconds(t)) or abs(t) > MAX_TIME:
             raise TimeError(f"{t} is no time in seconds")
         if now is not None and t > now + FARTHEST:
             raise TimeError(
@@ -363,3 +377,9 @@ class FleetEstimator(Door):
                 f"nothing is predicted farther than {FARTHEST:g} s ahead"
             )
         return t if last is None or t > last else last + TICK
+
+
+def _seconds(t: Any) -> float:
+    if not isinstance(t, Real):
+        raise TimeError(f"{t!r} is no time in seconds")
+    return float(t)

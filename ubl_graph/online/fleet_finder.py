@@ -247,8 +247,9 @@ def find_target(target: Target, seen: Sequence[Seen], epoch: float) -> Found:
     if len(seen) < 3:
         return Found(None, "initialising", "waiting for ranges", epoch)
     residuals = target_residuals(target, seen, epoch)
-    mean, sigma = known_of(target, epoch)
-    up = mean[2] if sigma[2] < 0.5 * FREE_POSITION else np.nan
+    mean, sigma, phi = known_of(target, epoch)
+    up_sigma = float(np.linalg.norm(phi[2] * sigma))
+    up = mean[2] if up_sigma < 0.5 * FREE_POSITION else np.nan
     nearest = min(seen, key=lambda s: s.distance)
     ups = (
         [up]
@@ -268,8 +269,17 @@ def find_target(target: Target, seen: Sequence[Seen], epoch: float) -> Found:
     return _judged(found, seen, epoch, heading=False)
 
 
-def known_of(target: Target, epoch: float) -> tuple[FloatArray, FloatArray]:
-    """What is known of a target beforehand, at a time (s): mean and sigma, (3,) or (6,)."""
+def known_of(target: Target, epoch: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """What is known of a target beforehand.
+
+    Returns
+    -------
+    mean, sigma : array, shape (3,) or (6,)
+        Independent, at the time that the target states (at `epoch` (s) where it states none).
+    phi : array, shape (3, 3) or (6, 6)
+        What carries them to the epoch: its position has gone on with its velocity since, and is
+        correlated with it.
+    """
     size = 6 if target.moves else 3
     mean, sigma = np.zeros(size), np.full(size, FREE_POSITION)
     sigma[:3] = np.maximum(target.sigma, LEAST_SIGMA)
@@ -277,10 +287,11 @@ def known_of(target: Target, epoch: float) -> tuple[FloatArray, FloatArray]:
         mean[:3] = target.position
     if target.moves:
         sigma[3:] = np.maximum(target.velocity_sigma, LEAST_SIGMA)
-        if target.t is not None:
-            # The velocity is unknown: so is where it carried the target since.
-            sigma[:3] = np.hypot(sigma[:3], sigma[3:] * abs(epoch - target.t))
-    return mean, sigma
+    phi = np.eye(size)
+    if target.moves and target.t is not None:
+        phi[:3, 3:] = (epoch - target.t) * np.eye(3)
+    # The mean's velocity is none: it stays where it is.
+    return mean, sigma, phi
 
 
 def target_residuals(target: Target, seen: Sequence[Seen], epoch: float) -> Residuals:
@@ -289,14 +300,16 @@ def target_residuals(target: Target, seen: Sequence[Seen], epoch: float) -> Resi
     later = np.array([s.t for s in seen]) - epoch
     distance = np.array([s.distance for s in seen])
     sigma = np.sqrt([s.sigma**2 + s.variance for s in seen])
-    mean, spread = known_of(target, epoch)
+    mean, spread, phi = known_of(target, epoch)
+    white = np.linalg.inv(phi) / spread[:, None]
 
     def residuals(q: FloatArray) -> FloatArray:
         off = q[:, None, :3] - places
         if q.shape[1] == 6:
             off = off + later[:, None] * q[:, None, 3:]
         length = np.sqrt(np.einsum("sni,sni->sn", off, off))
-        return np.concatenate([shaped((length - distance) / sigma), (q - mean) / spread], axis=1)
+        known = (q - mean) @ white.T
+        return np.concatenate([shaped((length - distance) / sigma), known], axis=1)
 
     return residuals
 

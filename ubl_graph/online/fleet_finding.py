@@ -201,8 +201,10 @@ class Finding:
         if found.status != "ok" or found.place is None:
             return False
         name = TARGET + target.name
-        mean, sigma = known_of(target, epoch)
+        mean, sigma, phi = known_of(target, epoch)
         core.window.share(name, mean, sigma)
+        keys = [(name, i) for i in range(len(mean))]
+        core.window.prior.evolve(keys, phi)
         if past:
             # What is past comes in as a prior; what waits becomes rows of the window.
             x = found.place.value
@@ -210,7 +212,6 @@ class Finding:
             at = residuals(x[None])[0, : len(past)]
             trials = x + DELTA * np.eye(len(x))
             slope = (residuals(trials)[:, : len(past)] - at).T / DELTA
-            keys = [(name, i) for i in range(len(x))]
             core.window.prior.learn(keys, slope, slope @ x - at)
         core.window.shared[name] = found.place.value.copy()
         self._remembered[target.name].clear()

@@ -297,6 +297,19 @@ class Line:
         """The last node that is not after a time; the first one where all are."""
         return self.nodes[max(bisect_right(self.nodes, t + INSTANT, key=lambda n: n.t) - 1, 0)]
 
+    def take_up(self, t: float, up: float) -> bool:
+        """Note the height (m) of a fix, which a depth overrules; whether it is new."""
+        at = bisect_left(self.ups, (t, up))
+        if self.depth_sigma is not None or self.ups[at : at + 1] == [(t, up)]:
+            return False
+        self.ups.insert(at, (t, up))
+        return True
+
+    def drop_up(self, t: float, up: float) -> None:
+        """Forget the height of a fix that was refused."""
+        if self.depth_sigma is None:
+            self.ups = [one for one in self.ups if one != (t, up)]
+
     def up_at(self, t: FloatArray) -> FloatArray:
         """Up of a planar vehicle, (N,), m."""
         if not self.ups:

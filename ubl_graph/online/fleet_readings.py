@@ -19,6 +19,7 @@ from ubl_graph.online.buffer import Entry
 from ubl_graph.online.fleet_blocks import Factor
 from ubl_graph.online.fleet_line import Line, Node, turns_and_ways
 from ubl_graph.online.fleet_window import Window
+from ubl_graph.online.gate import Gate, limit
 from ubl_graph.pose_states import COMPASS_SIGMA
 
 #: Nodes of a vehicle are no farther apart than this share of the lag, nor than this, s.
@@ -32,6 +33,10 @@ FIX_SHARE, FIX = 1.0 / 60.0, 5.0
 LEG_SHARE = 0.01
 #: A depth is known at a node where a reading is so near, s.
 DEPTH_NEAR = 10.0
+#: Nothing goes up or down faster than this, m/s.
+VERTICAL_SPEED = 10.0
+#: Depths that contradict the ones before are believed once so many in a row agree.
+PERSISTS = 3
 
 
 class Readings:
@@ -55,6 +60,7 @@ class Readings:
         self._heads: dict[str, dict[Node, tuple[Factor, list[tuple[float, float, float]]]]] = {
             name: {} for name in self.lines
         }
+        self._doubted: dict[str, list[Entry]] = {name: [] for name in self.lines}
         self._deep: dict[str, set[Node]] = {name: set() for name in self.lines}
         self._upright: dict[str, set[Node]] = {name: set() for name in self.lines}
 
@@ -244,15 +250,50 @@ class Readings:
             self.window.add(Factor("depth", line, [node], [], (depth, line.depth_sigma)))
         self._deep[name] = deep.intersection(line.nodes)
 
-    def take_up(self, line: Line, t: float, up: float, sigma: float | None) -> None:
-        """Note a height: of a depth (with its sigma), or of a fix, which a depth overrules."""
-        if sigma is not None and line.depth_sigma is None:
+    def take_depth(self, line: Line, gate: Gate, entry: Entry) -> str:
+        """Note a depth; why it is refused, empty where it is not.
+
+        One that its neighbours in time contradict waits until others after it agree.
+        """
+        if line.depth_sigma is None:
+            # A depth overrules the heights of fixes.
             line.ups.clear()
-        if sigma is None and line.depth_sigma is not None:
-            return
-        if sigma is not None:
+        t, depth, sigma = entry.values
+        doubted = self._doubted[line.member.name]
+        why = _misfit(line.ups, t, -depth, sigma)
+        if not why:
+            doubted.clear()
+            gate.accept(entry)
             line.depth_sigma = sigma
-        insort(line.ups, (t, up))
+            insort(line.ups, (t, -depth))
+            return ""
+        entry.gated, entry.reason = True, why
+        gate.refuse(entry)
+        agreeing = [e for e in doubted if not _misfit([(e.t, -e.values[1])], t, -depth, sigma)]
+        doubted[:] = [*agreeing, entry]
+        if len(doubted) < PERSISTS:
+            return why
+        if len(line.ups) < PERSISTS:
+            # Fewer said otherwise.
+            line.ups.clear()
+        for one in doubted:
+            one.gated, one.reason = False, ""
+            gate.change_mind(one)
+            insort(line.ups, (one.t, -one.values[1]))
+        line.depth_sigma = sigma
+        gate.run.clear()
+        doubted.clear()
+        return ""
+
+
+def _misfit(ups: Sequence[tuple[float, float]], t: float, up: float, sigma: float) -> str:
+    """Why a height (m) cannot be, by its neighbours in time; empty where it can."""
+    at = bisect_left(ups, (t, up))
+    for there, other in ups[max(at - 1, 0) : at + 1]:
+        apart, dt = abs(up - other), abs(t - there)
+        if apart > VERTICAL_SPEED * dt + limit(1) * np.sqrt(2.0) * sigma:
+            return f"{apart:.0f} m from the depth {dt:.1f} s before or after it"
+    return ""
 
 
 def _fused(

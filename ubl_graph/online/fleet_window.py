@@ -122,11 +122,16 @@ class Window:
             line.refresh()
             if not line.planar:
                 self._unwind(line)
-        system = System(self.fleet, self.lines, self.factors, self.prior, self.shared, self.epoch)
+        system = self._made()
         if not system.nodes:
             return []
         point = system.evaluate(system.x)
         verdicts, first = judged(system, point)
+        if self._take_ups(verdicts):
+            # Ranges that came with the fixes are judged at the heights that these say.
+            system = self._made()
+            point = system.evaluate(system.x)
+            verdicts, first = judged(system, point)
         refused = [v.factor for v in verdicts if not v.accepted]
         for verdict in verdicts:
             verdict.factor.fresh = False
@@ -147,6 +152,23 @@ class Window:
         self._point, self._system = point, system
         self._changed = False
         return verdicts
+
+    def _made(self) -> System:
+        return System(self.fleet, self.lines, self.factors, self.prior, self.shared, self.epoch)
+
+    def _take_ups(self, verdicts: Sequence[Verdict]) -> bool:
+        """Take up the heights of fixes of planar vehicles that passed, and no others'."""
+        new = False
+        for verdict in verdicts:
+            factor, entry = verdict.factor, verdict.factor.entry
+            if entry is None or entry.kind != "position" or entry.values[1].shape[1] < 3:
+                continue
+            up = float(entry.values[1][0, 2])
+            if factor.line.planar and verdict.accepted:
+                new |= factor.line.take_up(entry.t, up)
+            elif factor.line.planar:
+                factor.line.drop_up(entry.t, up)
+        return new
 
     def restart(self) -> None:
         """Take for the past what the last solution knew of each first node and state alone."""
