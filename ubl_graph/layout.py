@@ -9,6 +9,7 @@ columns: one key each.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -100,7 +101,7 @@ class Chain:
         return slice(self.first, self.first + len(self.t))
 
 
-class Columns:
+class Columns(ABC):
     """What solvers ask of a layout.
 
     Attributes
@@ -115,29 +116,34 @@ class Columns:
     shared: tuple[tuple[str, int], ...]
 
     @cached_property
+    @abstractmethod
     def node_count(self) -> int:
         """Nodes in all."""
-        raise NotImplementedError
+        ...
 
     @cached_property
+    @abstractmethod
     def node_width(self) -> int:
         """Columns of one node, of the widest where they differ."""
-        raise NotImplementedError
+        ...
 
     @cached_property
+    @abstractmethod
     def inner(self) -> int:
         """Columns of all nodes; behind them stands what nodes share."""
-        raise NotImplementedError
+        ...
 
     @cached_property
+    @abstractmethod
     def size(self) -> int:
         """Columns in all."""
-        raise NotImplementedError
+        ...
 
     @cached_property
+    @abstractmethod
     def variables(self) -> tuple[Variable, ...]:
         """Every variable, in order of its columns."""
-        raise NotImplementedError
+        ...
 
     @cached_property
     def variable_of_column(self) -> IntArray:
