@@ -104,7 +104,9 @@ def tracks(path: Path) -> None:
 def own_errors(found: Mapping[str, Found], path: Path) -> None:
     """Figure 6: own errors over time, by system."""
     figure = Figure(figsize=(10.0, 6.5), layout="constrained")
-    panels = figure.subplots(len(plans.BOTH), len(NAMES) - 1, sharex=True, sharey=True)
+    panels = figure.subplots(
+        len(plans.BOTH), len(NAMES) - 1, sharex=True, sharey=True, squeeze=False
+    )
     for line, settings in zip(panels, plans.BOTH, strict=True):
         title = plans.label(settings)
         filters = found[f"filters, {title}"]

@@ -46,9 +46,10 @@ TINY = plans.Plan(
     targets=2,
     target_runs=1,
 )
-#: Of each sweep some, and maps of the graph from short runs; all is run by the slow test.
+#: Of settings and sweeps some, and maps of the graph from short runs; all is run by the slow test.
 SOME = {
     "QUICK": TINY,
+    "BOTH": (plans.SHORT,),
     "SPEEDS": (0.1,),
     "YAW_RATES": (0.01, 0.1),
     "TIMES": (120.0, 600.0),
@@ -66,7 +67,7 @@ def made(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         for name, value in SOME.items():
             patch.setattr(plans, name, value)
-        for name in ("TIMES", "TARGET_TIME"):
+        for name in ("BOTH", "TIMES", "TARGET_TIME"):
             patch.setattr(tables, name, SOME[name])
         patch.setattr(script, "ProcessPool", SerialExecutor)
         assert script.main(["-o", str(folder), "--quick"]) == 0
@@ -86,7 +87,7 @@ def picked(numbers, table, case="", quantity=""):
     ]
 
 
-def whole(numbers, sweep, times):
+def whole(numbers, settings, sweep, times):
     """Check that every row is there and has its numbers."""
     rows = numbers["rows"]
     assert all(list(row) == ROW for row in rows)
@@ -94,12 +95,12 @@ def whole(numbers, sweep, times):
     names = [(r["table"], r["case"], r["quantity"]) for r in rows]
     assert len(set(names)) == len(names)
     assert Counter(r["table"] for r in rows) == {
-        "Fig. 6": 3 * 2,
-        "Fig. 7": 3 * 4 + 3,
-        "Fig. 8": 3 * 2 + 3,
-        "Batch": 2 * 4,
-        "Fixed lag, 600 s": 2 * 2 * 4,
-        "All six pairs ranged": 2 * 4,
+        "Fig. 6": (settings + 1) * 2,
+        "Fig. 7": (settings + 1) * 4 + 3,
+        "Fig. 8": (settings + 1) * 2 + 3,
+        "Batch": settings * 4,
+        "Fixed lag, 600 s": settings * 2 * 4,
+        "All six pairs ranged": settings * 4,
         "Target ranged each period": 3,
         "Consistency": 3 * 4 + 1,
         "Fig. 9": sweep * 8,
@@ -113,7 +114,7 @@ def whole(numbers, sweep, times):
         # A number of the paper is one of its own systems', which the filter here is.
         assert row["paper"] is None or (row["baseline"] is not None and row["graph"] is None)
     lost, compared = behind(rows)
-    assert numbers["compared"] == compared == 3 * 3 + 8 + 16 + sweep + times * 2
+    assert numbers["compared"] == compared == 3 * 3 + settings * 12 + sweep + times * 2
     assert numbers["ahead"] == compared - len(lost)
     assert all(r["baseline"] is None for r in rows if r["table"] == "All six pairs ranged")
 
@@ -121,11 +122,11 @@ def whole(numbers, sweep, times):
 def test_every_table_is_there_and_every_row_is_whole(numbers):
     assert numbers["quick"] is True
     assert numbers["ran"]["filtered"] == 20
-    whole(numbers, 3, 2)
+    whole(numbers, 1, 3, 2)
 
 
 def test_the_papers_numbers_come_out_within_what_few_runs_leave_to_chance(numbers):
-    for case in ("60 s, 30 m, 20 runs", "120 s, 15 m, 20 runs", "60 s, 30 m, 30 runs"):
+    for case in ("60 s, 30 m, 20 runs", "60 s, 30 m, 30 runs"):
         plain, fused = picked(numbers, "Fig. 6", case)
         assert (plain["paper"], fused["paper"]) == (36.0, 14.0)
         assert plain["baseline"] == pytest.approx(36.0, abs=9.0)
@@ -356,7 +357,7 @@ def test_the_whole_quick_run(tmp_path):
     assert {p.name for p in (tmp_path / "out").iterdir()} == FIGURES | {"zhao.json"}
     numbers = json.loads((tmp_path / "out" / "zhao.json").read_text())
     sweep = len(plans.SPEEDS) + len(plans.YAW_RATES)
-    whole(numbers, sweep, len(plans.TIMES))
+    whole(numbers, len(plans.BOTH), sweep, len(plans.TIMES))
     assert f"ahead in {numbers['ahead']} of {numbers['compared']} errors" in done.stdout
     # Smoothed, every follower is known better on average than filtered, even over few runs.
     for row in picked(numbers, "Batch", quantity="time mean"):

@@ -198,7 +198,7 @@ class RangeBlock:
         self.model = model
         self.measured = measured
         self.sigma = sigma
-        self._here, self._there = here, there
+        self.antenna, self._there = here, there
         m, n_legs = len(measured), here.legs
         self._sound_speed = None if sound_speed is None else by_leg(sound_speed, m, n_legs)
         self._clock = None if clock is None else by_leg(clock, m, 1)
@@ -216,7 +216,7 @@ class RangeBlock:
         `x`.
         """
         terms = self._model_terms(x, ALL_ROWS)
-        here = self._here.variance(terms.slopes, terms.here)
+        here = self.antenna.variance(terms.slopes, terms.here)
         return np.sqrt(self.sigma**2 + here + self._there.variance(terms.back, terms.there))
 
     def found(self, x: FloatArray) -> BoolArray:
@@ -238,7 +238,7 @@ class RangeBlock:
         if not jacobian:
             return residual, None
         m = len(terms.total)
-        parts = [self._here.slopes(terms.slopes, terms.here, rows)]
+        parts = [self.antenna.slopes(terms.slopes, terms.here, rows)]
         if self._sound_speed is not None:
             parts.append((terms.times[..., None] * self._sound_speed[1][rows]).reshape(m, -1))
         if self._clock is not None:
@@ -249,7 +249,7 @@ class RangeBlock:
         return residual, (jacobians / sigma[:, None])[:, None, :]
 
     def _model_terms(self, x: FloatArray, rows: slice) -> _Terms:
-        here, held = self._here.positions(x, rows)
+        here, held = self.antenna.positions(x, rows)
         there, held_there = self._there.positions(x, rows)
         m, n_legs = here.shape[:2]
         travel = self.model(here.reshape(-1, 3), there.reshape(-1, 3))
