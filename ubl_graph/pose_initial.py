@@ -119,7 +119,7 @@ def reckoned_track(mission: Mission, model: SegmentModel) -> Track | None:
 
     Returns
     -------
-    Track or None
+    ubl_graph.track.Track or None
         None where the start does not say enough, or there is no odometry.
     """
     start = model.segment.start

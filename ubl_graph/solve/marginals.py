@@ -59,7 +59,7 @@ class Covariances:
         Of each node's columns (rows) with the next one's, scaled.
     shared : array, shape (S, S)
         Of what all nodes share, scaled.
-    scale : array, shape (size,)
+    scale : array, shape (K,)
         What a scaled column is to be multiplied by.
     unresolved : array of bool, shape (N,)
         Nodes whose position varies so much more than their neighbours hold them that double
