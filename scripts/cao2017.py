@@ -19,10 +19,9 @@ from typing import Any
 import cao2017_plan as plans
 import cao2017_rows as tables
 from cao2017_cases import run
-from paper_rows import Row, behind, check, show, write
+from paper_rows import Row, behind, check, command, show, write
 from replay import Parser, progress
 
-from ubl_graph.errors import UblGraphError
 from ubl_graph.study import ProcessPool, run_study
 
 #: Of the command and its file.
@@ -76,24 +75,9 @@ def reproduce(given: argparse.Namespace) -> list[str]:
     return []
 
 
-def warn(text: str) -> None:
-    """One line on standard error."""
-    print(f"{NAME}: {' '.join(text.split())}", file=sys.stderr)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run; what is wrong with the input becomes one line."""
-    try:
-        failures = reproduce(parser().parse_args(arguments))
-    except UblGraphError as error:
-        warn(str(error))
-        return 2
-    except KeyboardInterrupt:
-        warn("interrupted")
-        return 130
-    for failure in failures:
-        warn(failure)
-    return 1 if failures else 0
+    return command(NAME, lambda: reproduce(parser().parse_args(arguments)))
 
 
 if __name__ == "__main__":

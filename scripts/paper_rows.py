@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -12,7 +13,7 @@ from replay import staged
 from rich.console import Console
 from rich.table import Table
 
-from ubl_graph.errors import DataError
+from ubl_graph.errors import DataError, UblGraphError
 
 #: Keys table, case, quantity, unit, paper, baseline, graph.
 Row: TypeAlias = dict[str, Any]
@@ -54,6 +55,25 @@ def write(folder: Path, name: str, numbers: Mapping[str, Any], figures: Mapping[
         if made:
             with suppress(OSError):
                 folder.rmdir()  # only where nothing came of it
+
+
+def command(name: str, reproduce: Callable[[], Sequence[str]]) -> int:
+    """Run a script's command; what is wrong with the input becomes one line. Its exit code."""
+
+    def warn(text: str) -> None:
+        print(f"{name}: {' '.join(text.split())}", file=sys.stderr)
+
+    try:
+        failures = reproduce()
+    except UblGraphError as error:
+        warn(str(error))
+        return 2
+    except KeyboardInterrupt:
+        warn("interrupted")
+        return 130
+    for failure in failures:
+        warn(failure)
+    return 1 if failures else 0
 
 
 def show(rows: Sequence[Row]) -> None:

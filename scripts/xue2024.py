@@ -18,11 +18,10 @@ from pathlib import Path
 from typing import Any
 
 import xue2024_rows as tables
-from paper_rows import behind, check, show, write
+from paper_rows import behind, check, command, show, write
 from replay import Parser, progress
 from xue2024_cases import gathered, run
 
-from ubl_graph.errors import UblGraphError
 from ubl_graph.study import ProcessPool, run_study
 
 #: Of the command and its file.
@@ -83,26 +82,16 @@ def record(given: argparse.Namespace) -> list[str]:
     return []
 
 
-def warn(text: str) -> None:
-    """One line on standard error."""
-    print(f"{NAME}: {' '.join(text.split())}", file=sys.stderr)
+def reproduce(arguments: Sequence[str] | None) -> list[str]:
+    """Run, write and print; what failed."""
+    given = parser().parse_args(arguments)
+    check(given.output)
+    return record(given) if given.garpos else simulate(given)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run; what is wrong with the input becomes one line."""
-    try:
-        given = parser().parse_args(arguments)
-        check(given.output)
-        failures = record(given) if given.garpos else simulate(given)
-    except UblGraphError as error:
-        warn(str(error))
-        return 2
-    except KeyboardInterrupt:
-        warn("interrupted")
-        return 130
-    for failure in failures:
-        warn(failure)
-    return 1 if failures else 0
+    return command(NAME, lambda: reproduce(arguments))
 
 
 if __name__ == "__main__":

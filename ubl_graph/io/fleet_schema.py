@@ -38,7 +38,7 @@ class MemberTable(VehicleTable):
 
     name: str
     start: StartTable | None = None
-    options: MemberOptionsTable = MemberOptionsTable()  # pyright: ignore[reportInvalidTypeForm]
+    options: MemberOptionsTable = MemberOptionsTable()  # pyright: ignore[reportInvalidTypeForm] - `create_model`
     data: CsvDataTable = CsvDataTable()
 
 
@@ -69,7 +69,7 @@ class FleetDocument(Table):
     vehicle: list[MemberTable]
     target: list[TargetTable] = Field(default_factory=list[TargetTable])
     sound_speed: SoundSpeedTable | None = None
-    options: OptionsTable = OptionsTable()  # pyright: ignore[reportInvalidTypeForm]
+    options: OptionsTable = OptionsTable()  # pyright: ignore[reportInvalidTypeForm] - `create_model`
     data: FleetDataTable = FleetDataTable()
 
 

@@ -182,7 +182,7 @@ class CsvDocument(Table):
     sound_speed: SoundSpeedTable | None = None
     vehicle: VehicleTable = VehicleTable()
     start: StartTable | None = None
-    options: OptionsTable = OptionsTable()  # pyright: ignore[reportInvalidTypeForm]
+    options: OptionsTable = OptionsTable()  # pyright: ignore[reportInvalidTypeForm] - `create_model`
     data: CsvDataTable = CsvDataTable()
 
 
@@ -190,7 +190,7 @@ class GarposDocument(Table):
     """A mission file with data in a GARPOS campaign's files."""
 
     mission: NamedTable = NamedTable()
-    options: OptionsTable = OptionsTable()  # pyright: ignore[reportInvalidTypeForm]
+    options: OptionsTable = OptionsTable()  # pyright: ignore[reportInvalidTypeForm] - `create_model`
     data: GarposDataTable
 
 
@@ -200,7 +200,7 @@ class PyfgDocument(Table):
     mission: MissionTable = MissionTable()
     vehicle: VehicleTable = VehicleTable()
     start: StartTable | None = None
-    options: OptionsTable = OptionsTable()  # pyright: ignore[reportInvalidTypeForm]
+    options: OptionsTable = OptionsTable()  # pyright: ignore[reportInvalidTypeForm] - `create_model`
     data: PyfgDataTable
 
 
