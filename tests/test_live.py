@@ -84,7 +84,7 @@ class FixedLagEstimator:
         self.t = max(self.t + 1e-3, t or 0.0)
         return SimpleNamespace(
             t=self.t, position=None, velocity=None, covariance=None,
-            status="initialising", reasons=("none",), rotation=None,
+            status="initialising", reasons=("none",), rotation=None, hypotheses=(),
         )
 
     def flush(self):

@@ -578,7 +578,9 @@ def assert_same_run(a: Run, b: Run) -> None:
         if one.position is not None:
             assert np.abs(one.position - other.position).max() < 1e-9
             assert np.abs(one.velocity - other.velocity).max() < 1e-9
-            assert np.abs(one.covariance - other.covariance).max() < 1e-9
+            # Rows that are made anew differ by rounding, which another place's distance enlarges.
+            allowed = 1e-8 * max(1.0, np.abs(one.covariance).max())
+            assert np.abs(one.covariance - other.covariance).max() < allowed
 
 
 def split_run(mission: Mission, records: list[Records], at: int, path) -> tuple[Run, Run]:

@@ -481,6 +481,7 @@ class Estimate:
     status: str = "initialising"
     reasons: tuple[str, ...] = ("no position yet",)
     rotation: Any = None
+    hypotheses: tuple[Any, ...] = ()
 
 
 @dataclass

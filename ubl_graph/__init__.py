@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ubl_graph.acoustics import SoundSpeedProfile
     from ubl_graph.beacon import Beacon
+    from ubl_graph.consistency import assess
     from ubl_graph.cooperative.fleet import Fleet, Member, Target
     from ubl_graph.cooperative.result import FleetResult
     from ubl_graph.cooperative.smoother import smooth_fleet
@@ -51,7 +52,9 @@ if TYPE_CHECKING:
     from ubl_graph.options import Options
     from ubl_graph.result import Result
     from ubl_graph.smoother import smooth
+    from ubl_graph.survey import SurveyOptions, SurveyResult, calibrate
     from ubl_graph.trajectory import Trajectory
+    from ubl_graph.verdict import Consistency
 
 __version__ = "0.1.0"
 
@@ -101,6 +104,11 @@ _HOME = {
     "Options": "options",
     "Result": "result",
     "smooth": "smoother",
+    "SurveyOptions": "survey",
+    "SurveyResult": "survey",
+    "calibrate": "survey",
+    "assess": "consistency",
+    "Consistency": "verdict",
     "Trajectory": "trajectory",
 }
 
@@ -115,6 +123,7 @@ __all__ = [  # noqa: RUF022 - by subject, as in `_HOME`
     "AngularRate",
     "Attitude",
     "Beacon",
+    "Consistency",
     "Depth",
     "Errors",
     "Estimate",
@@ -140,12 +149,16 @@ __all__ = [  # noqa: RUF022 - by subject, as in `_HOME`
     "SlantRange",
     "SoundSpeedProfile",
     "Start",
+    "SurveyOptions",
+    "SurveyResult",
     "Target",
     "Trajectory",
     "TwoWayRange",
     "Vehicle",
     "Velocity",
     "__version__",
+    "assess",
+    "calibrate",
     "evaluate",
     "load_fleet",
     "load_mission",

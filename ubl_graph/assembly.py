@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ubl_graph.arrays import BoolArray, FloatArray
+from ubl_graph.arrays import BoolArray, FloatArray, IntArray
 from ubl_graph.builder import SegmentModel
+from ubl_graph.factors.block import LinearBlock
 from ubl_graph.factors.ranges import RangeBlock
 from ubl_graph.layout import KINEMATIC, Chain
 from ubl_graph.measurements import SlantRange
@@ -14,7 +15,7 @@ from ubl_graph.options import Options
 from ubl_graph.pings import Pings, measured_times
 from ubl_graph.pose_assembly import pose_trajectory
 from ubl_graph.problem import LeastSquares, Problem
-from ubl_graph.result import RangeResiduals, SegmentResult, Shared, SlowState, Status
+from ubl_graph.result import Hypothesis, RangeResiduals, SegmentResult, Shared, SlowState, Status
 from ubl_graph.solve.marginals import Covariances
 from ubl_graph.solve.rounds import Solution
 from ubl_graph.trajectory import NodeCovariance, Trajectory
@@ -39,6 +40,8 @@ def assemble_segment(
     runner_up: float | None,
     options: Options,
     limit: float | None = None,
+    hypotheses: tuple[Hypothesis, ...] = (),
+    pruned: float = 0.0,
 ) -> SegmentResult:
     """Everything that a user reads of one segment.
 
@@ -63,12 +66,13 @@ def assemble_segment(
     limit : float, optional
         Standard deviation beyond which a position counts as not observed, m; left out, half the
         typical range.
+    hypotheses : tuple of Hypothesis
+        Tracks that the data allow.
+    pruned : float
+        Weight of those that were left out.
     """
     layout = problem.layout
-    if layout.node == "point":
-        trajectory = _point_trajectory(problem, solution, marginals, chain)
-    else:
-        trajectory = pose_trajectory(problem, solution.x, marginals, chain, options)
+    trajectory = trajectory_of(problem, solution, marginals, chain, options)
     slow = {name: _slow_state(problem, solution, marginals, chain, name) for name, _ in layout.slow}
     residuals = _range_residuals(problem, solution, chain, model)
     if limit is None:
@@ -91,7 +95,18 @@ def assemble_segment(
         dof,
         None if rival_track is None else rival_track[chain.nodes],
         runner_up,
+        hypotheses,
+        pruned,
     )
+
+
+def trajectory_of(
+    problem: Problem, solution: Solution, marginals: Covariances, chain: Chain, options: Options
+) -> Trajectory:
+    """The trajectory of a segment, of points or of poses, with covariances."""
+    if problem.layout.node == "point":
+        return _point_trajectory(problem, solution, marginals, chain)
+    return pose_trajectory(problem, solution.x, marginals, chain, options)
 
 
 def _point_trajectory(
@@ -115,12 +130,43 @@ def _point_trajectory(
     )
 
 
-def shared_of(problem: Problem, solution: Solution, marginals: Covariances) -> dict[str, Shared]:
-    """Estimates of what all nodes share."""
-    return {
-        name: Shared(problem.layout.get(solution.x, name), marginals.of(name))
-        for name, _ in problem.layout.shared
-    }
+def shared_of(
+    problem: Problem,
+    solution: Solution,
+    marginals: Covariances,
+    expected: FloatArray | None = None,
+) -> dict[str, Shared]:
+    """Estimates of what all nodes share.
+
+    Parameters
+    ----------
+    problem, solution, marginals
+        Solved, with covariances.
+    expected : array, optional
+        What `shared_covariance` said at the start.
+    """
+    layout, out, first = problem.layout, dict[str, Shared](), 0
+    for name, size in layout.shared:
+        own = slice(first, first + size)
+        first += size
+        prior = prior_sigma(problem, layout.shared_columns(name), layout.unit(name))
+        promised = None if expected is None else expected[own, own]
+        out[name] = Shared(layout.get(solution.x, name), marginals.of(name), prior, promised)
+    return out
+
+
+def prior_sigma(problem: Problem, columns: IntArray, unit: float) -> FloatArray | None:
+    """Standard deviations, SI, of the prior on some columns (size,); None where there is none."""
+    for block in problem.blocks:
+        if isinstance(block, LinearBlock) and block.name.endswith(" prior"):
+            row = (
+                np.flatnonzero((block.columns == columns).all(axis=1))
+                if (block.columns.shape[1] == len(columns))
+                else np.empty(0)
+            )
+            if len(row):
+                return unit / np.diagonal(block.matrix[int(row[0])])
+    return None
 
 
 def beacons_of(mission: Mission, shared: dict[str, Shared]) -> dict[str, Shared]:
@@ -135,7 +181,10 @@ def _slow_state(
     problem: Problem, solution: Solution, marginals: Covariances, chain: Chain, name: str
 ) -> SlowState:
     variance = np.einsum("nii->ni", marginals.of(name)[chain.nodes])
-    return SlowState(chain.t, problem.layout.get(solution.x, name)[chain.nodes], np.sqrt(variance))
+    layout = problem.layout
+    first = layout.node_columns(name, np.array([chain.first]))[0]
+    prior = prior_sigma(problem, first, layout.unit(name))
+    return SlowState(chain.t, layout.get(solution.x, name)[chain.nodes], np.sqrt(variance), prior)
 
 
 def _range_residuals(

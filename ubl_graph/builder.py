@@ -17,6 +17,7 @@ from ubl_graph.factors.gyro import GyroTrack
 from ubl_graph.factors.odometry import DVL_STATES, Preintegration, node_velocity, odometry
 from ubl_graph.factors.ranges import (
     Antenna,
+    Arm,
     FixedAntenna,
     FreeAntenna,
     PointAntenna,
@@ -25,6 +26,7 @@ from ubl_graph.factors.ranges import (
 from ubl_graph.layout import Chain, Interpolation, Layout
 from ubl_graph.measurements import OneWayRange, PositionFix, SlantRange
 from ubl_graph.mission import Segment, Setup, Start
+from ubl_graph.nodes import NOMINAL_SPEED
 from ubl_graph.options import Options
 from ubl_graph.pings import (
     Pings,
@@ -47,6 +49,8 @@ FREE_ACCELERATION = 100.0
 ODOMETRY_PSD = 1.0
 #: s
 HOUR = 3600.0
+#: Of the names of what each beacon's ranges are off by.
+RANGE_BIAS = "range_bias "
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +109,10 @@ def shared_states(setup: Setup, lasting: float | None) -> tuple[tuple[str, int],
         if heading_walks(setup.options, lasting):
             sigmas["heading_bias"] = np.zeros(1)
         shared += [(name, size) for name, size in DVL_STATES if sigmas[name][-1] > 0.0]
+    if setup.options.lever_arm_sigma > 0.0:
+        shared.append(("lever_arm", 3))
+    if setup.options.range_bias_sigma > 0.0:
+        shared += [(f"{RANGE_BIAS}{b.name}", 1) for b in setup.beacons]
     if setup.options.estimate_beacons:
         shared += [(f"beacon {b.name}", 3) for b in setup.beacons]
     return tuple(shared)
@@ -245,6 +253,15 @@ class Builder:
                 columns = self.layout.shared_columns(name)[None]
                 sigma = np.array(sigma / self.layout.unit(name))
                 blocks.append(linear.prior(name, columns, np.zeros(columns.shape), sigma))
+        for name, size in self.layout.shared:
+            sigma = {"lever_arm": self.options.lever_arm_sigma}.get(name)
+            if name.startswith(RANGE_BIAS):
+                sigma = self.options.range_bias_sigma
+            if sigma is not None:
+                columns = self.layout.shared_columns(name)[None]
+                blocks.append(
+                    linear.prior(name.strip(), columns, np.zeros((1, size)), np.array(sigma))
+                )
         if self.options.estimate_beacons:
             for beacon in self.setup.beacons:
                 columns = self.layout.shared_columns(f"beacon {beacon.name}")[None]
@@ -337,8 +354,12 @@ class Builder:
         """The transducer at each leg's time (M, L)."""
         position = self.layout.positions_at(chain, times.ravel())
         lever = attitude.lever(self.setup.vehicle.transducer, times.ravel())
+        arm = None
+        if self.layout.has("lever_arm"):
+            rotation = attitude.at(times.ravel()).reshape(*times.shape, 3, 3)
+            arm = Arm(self.layout.shared_columns("lever_arm"), rotation)
         return PointAntenna(
-            position, lever.reshape(*times.shape, 3), self.psd, self._variance(position)
+            position, lever.reshape(*times.shape, 3), self.psd, self._variance(position), arm
         )
 
     def range_block(self, chain: Chain, pings: Pings, attitude: AttitudeTrack) -> RangeBlock:
@@ -363,11 +384,14 @@ class Builder:
         else:
             places = np.stack([b.position for b in self.setup.beacons])[which]
             there = FixedAntenna(places, times.shape[1])
-        sound_speed = clock = None
+        sound_speed = None
+        offsets: list[Interpolation] = []
         if self.layout.has("sound_speed"):
             sound_speed = self.layout.slow_at("sound_speed", chain, legs_at)
         if isinstance(pings, OneWayRange):
-            clock = self.layout.slow_at("clock_offset", chain, legs_at)
+            offsets.append(self.layout.slow_at("clock_offset", chain, legs_at))
+        if self.options.range_bias_sigma > 0.0:
+            offsets.append(self._range_bias(pings.beacon, times.shape[1]))
         measured, sigma = measured_times(pings)
         return RangeBlock(
             kind_of(pings),
@@ -378,8 +402,15 @@ class Builder:
             measured,
             sigma,
             sound_speed,
-            clock,
+            Interpolation.together(offsets) if offsets else None,
         )
+
+    def _range_bias(self, beacons: FloatArray, legs: int) -> Interpolation:
+        """What each ping's beacon makes its travel time too long by (M rows)."""
+        columns = np.stack([self.layout.shared_columns(f"{RANGE_BIAS}{n}") for n in beacons])
+        none = np.zeros(len(beacons))
+        weights = np.full((len(beacons), 1), legs / NOMINAL_SPEED)
+        return Interpolation(columns[:, None], weights, none, none)
 
     def _variance(self, position: Interpolation) -> FloatArray:
         """Interpolation variance at unit density, zero for a chain of one node."""

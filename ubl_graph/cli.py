@@ -91,7 +91,7 @@ def smooth(
         return
     loaded = _solved_by(load_mission(mission), solver)
     _check_output(output)
-    result = _smooth(loaded)
+    result = _judged(_smooth(loaded))
     _write(result, output, figures)
     _print_result(result)
     compared = evaluate(result)
@@ -116,7 +116,7 @@ def demo(
 
     _check_output(output)
     mission = _solved_by(demo_survey(seed)[0], solver)
-    result = _smooth(mission)
+    result = _judged(_smooth(mission))
     reckoned = dead_reckoning(mission)
     _write(result, output, figures, {"dead reckoning": list(reckoned.values())})
     _print_result(result)
@@ -180,6 +180,44 @@ def batch(
             typer.echo(f"{row.folder}: {row.status}: {row.reason}")
     if any(row.failed for row in rows):
         raise typer.Exit(1)
+
+
+@app.command()
+def calibrate(
+    mission: Annotated[Path, typer.Argument(metavar="MISSION.toml", help="The mission file.")],
+    output: Output,
+    figures: Figures = True,
+    sigma: Annotated[
+        float | None,
+        typer.Option(
+            min=1e-3,
+            metavar="METRES",
+            help="Standard deviation of given positions that have none; left out, they are free.",
+        ),
+    ] = None,
+) -> None:
+    """Survey a mission's beacons from a vehicle whose track is known, and check given positions.
+
+    Writes beacons.json, which a garpos mission takes as its beacons, result.json, residuals and
+    figures. Of a garpos mission the ship's track serves as data.
+
+    Example: ubl-graph calibrate survey.toml -o survey-out
+    """
+    from ubl_graph import cli_survey
+    from ubl_graph.io.survey_files import write_survey
+    from ubl_graph.survey import calibrate as run
+
+    loaded = cli_survey.load(mission, sigma)
+    _check_output(output)
+    with _progress(loaded.name) as report:
+        result = run(loaded, progress=report)
+    write_survey(result, output, figures)
+    typer.echo(f"written to {output}")
+    for line in cli_survey.lines(result):
+        typer.echo(line)
+    for warning in result.warnings:
+        typer.echo(f"warning: {warning}", err=True)
+    _show(cli_survey.table(result))
 
 
 @app.command()
@@ -282,6 +320,13 @@ def _smooth_fleet(file: Path, output: Path, figures: bool, solver: str | None) -
         _show(targets_table(result))
 
 
+def _judged(result: Result) -> Result:
+    """The result with a verdict on its sigmas."""
+    from ubl_graph.consistency import assess
+
+    return replace(result, consistency=assess(result))
+
+
 def _write(result: Result, folder: Path, figures: bool, beside: Any = None) -> None:
     from ubl_graph.io.result_files import write_result
 
@@ -325,6 +370,10 @@ def _print_result(result: Result) -> None:
     _print_status(result)
     if result.tuning is not None and result.tuning.chosen:
         typer.echo("chosen by the data: " + ", ".join(_chosen(result.tuning.chosen)))
+    if result.inflation is not None:
+        typer.echo(f"noise inflated: {result.inflation.verdict}")
+    if result.consistency is not None:
+        typer.echo(result.consistency.verdict)
     _show(segments_table(result))
 
 

@@ -1,19 +1,25 @@
-"""How far from an independent track, and whether the covariances say so."""
+"""How far from an independent track, and whether the covariances say so.
+
+Without such a track `held_out` and `consistency` judge by the pings themselves.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
-from ubl_graph.arrays import FloatArray
+from ubl_graph.arrays import BoolArray, FloatArray
 from ubl_graph.mission import Reference
 from ubl_graph.result import Result
 from ubl_graph.trajectory import Trajectory
 
 #: Seconds from a segment's ends from where on a time counts as interior.
 INTERIOR = 40.0
+#: Squared Mahalanobis length of the 95 % ellipse: chi-square with two degrees of freedom.
+ELLIPSE = -2.0 * math.log(0.05)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,19 +45,26 @@ class Errors:
     interior: np.ndarray
 
     @property
+    def covered(self) -> BoolArray:
+        """Which references lie inside the 95 % ellipse of the horizontal position, shape (M,)."""
+        return self.nees < ELLIPSE
+
+    @property
     def horizontal(self) -> FloatArray:
         """Length of the horizontal error, m, shape (M,)."""
         return np.hypot(self.error[:, 0], self.error[:, 1])
 
     def summary(self) -> dict[str, float | int | None]:
-        """Horizontal RMSE (m) over all and over the interior, mean NEES of the interior."""
+        """Horizontal RMSE (m) and mean NEES over all and over the interior, and the coverage."""
         inner = self.interior
         return {
             "count": len(self.t),
             "interior_count": int(inner.sum()),
             "horizontal_rmse_m": _rms(self.horizontal),
             "interior_horizontal_rmse_m": _rms(self.horizontal[inner]),
-            "interior_mean_nees_2dof": float(self.nees[inner].mean()) if inner.any() else None,
+            "mean_nees_2dof": _mean(self.nees),
+            "interior_mean_nees_2dof": _mean(self.nees[inner]),
+            "coverage_95": _mean(self.covered),
         }
 
     @staticmethod
@@ -82,6 +95,10 @@ def evaluate(result: Result) -> dict[str, Errors]:
         for segment, solved in zip(result.mission.segments, result.segments, strict=True)
         if segment.reference is not None and len(segment.reference.t)
     }
+
+
+def _mean(values: FloatArray | BoolArray) -> float | None:
+    return float(np.mean(values)) if len(values) else None
 
 
 def _rms(values: FloatArray) -> float | None:

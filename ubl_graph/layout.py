@@ -10,6 +10,7 @@ columns: one key each.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -373,6 +374,13 @@ class Interpolation:
     weights: FloatArray
     dt: FloatArray
     s: FloatArray
+
+    @staticmethod
+    def together(parts: Sequence[Interpolation]) -> Interpolation:
+        """The sum of several quantities of as many rows and components."""
+        columns = np.concatenate([part.columns for part in parts], axis=1)
+        weights = np.concatenate([part.weights for part in parts], axis=1)
+        return Interpolation(columns, weights, parts[0].dt, parts[0].s)
 
     def compact(self) -> Interpolation:
         """The same with the states of zero weight left out as far as all rows have some.

@@ -267,6 +267,6 @@ class Mission:
                 self.setup.check_beacons(rows)
         check_epochs(segment)
         if self.options.node == "point":
-            check_attitude(segment, self.vehicle, where)
+            check_attitude(segment, self.vehicle, self.options, where)
         if segment.velocity is not None:
             self.setup.check_current(segment.velocity)

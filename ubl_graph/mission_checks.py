@@ -212,7 +212,7 @@ def _span(rows: Any, begin: str, end: str) -> tuple[float, float]:
     return float(np.min(getattr(rows, first))), float(np.max(getattr(rows, last)))
 
 
-def check_attitude(segment: Segment, vehicle: Vehicle, where: str) -> None:
+def check_attitude(segment: Segment, vehicle: Vehicle, options: Options, where: str) -> None:
     """Refuse a segment of points that lacks the attitude which its sensors need.
 
     Raises
@@ -225,6 +225,7 @@ def check_attitude(segment: Segment, vehicle: Vehicle, where: str) -> None:
     needs = {
         "velocity": segment.velocity is not None,
         "vehicle.transducer": not vehicle.transducer.is_zero,
+        "options.lever_arm_sigma": options.lever_arm_sigma > 0.0,
         "vehicle.depth_sensor": not vehicle.depth_sensor.is_zero and segment.depth is not None,
         "vehicle.antenna": not vehicle.antenna.is_zero and segment.position is not None,
     }

@@ -27,7 +27,7 @@ from ubl_graph.pose_initial import find_tracks
 from ubl_graph.problem import Problem
 from ubl_graph.solve.banded import BandedEngine
 from ubl_graph.solve.evidence import log_evidence
-from ubl_graph.solve.rounds import graduated
+from ubl_graph.solve.robust import graduated
 from ubl_graph.track import Track, carried, start_vector
 from ubl_graph.trajectory import process_noise
 

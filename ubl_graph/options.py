@@ -15,12 +15,14 @@ from ubl_graph.errors import ConfigurationError
 Motion = Literal["constant_velocity", "constant_acceleration"]
 #: In place of a value: `smooth` chooses it by the data's own likelihood.
 Auto = Literal["auto"]
-Loss = Literal["cauchy", "huber", "geman_mcclure", "dcs", "none"]
+Loss = Literal["cauchy", "huber", "geman_mcclure", "dcs", "tukey", "none"]
 Rays = Literal["auto", "straight", "eigenray"]
 Solver = Literal["auto", "gtsam", "banded"]
 OnlineEngine = Literal["lm", "isam2"]
 Node = Literal["point", "pose2", "pose3"]
 OdometryNoise = Literal["given", "growing", "both"]
+Covariance = Literal["formal", "calibrated"]
+Noise = Literal["given", "inflated"]
 
 #: Options whose name begins so may be zero.
 MAY_VANISH = (
@@ -31,6 +33,8 @@ MAY_VANISH = (
     "heading_bias_",
     "gyro_",
     "odometry_",
+    "range_bias_",
+    "lever_arm_",
 )
 #: What the options that are left to the data say, and which ones may.
 AUTO: Auto = "auto"
@@ -99,6 +103,14 @@ class Options:
 
     estimate_beacons: bool = False
     """False: beacons are constants. True: unknowns with their `sigma` as prior."""
+
+    range_bias_sigma: float = 0.0
+    """Standard deviation of a constant error of each beacon's ranges, m (its turnaround, how it
+    detects a ping); 0 leaves the states out."""
+
+    lever_arm_sigma: float = 0.0
+    """Standard deviation of each component of the transducer's lever arm, m; 0 leaves the state
+    out."""
 
     estimate_current: bool = False
     """Whether the water current is estimated; needed for water-track velocities."""
@@ -183,6 +195,14 @@ class Options:
     confirm the answer up to 5 000 nodes (8 000 rows where nodes are poses); more than 64 shared
     unknowns GTSAM solves alone."""
 
+    covariance: Covariance = "formal"
+    """Covariances as the stated noise makes them, or multiplied by what held-out pings ask for
+    (docs/consistency.md)."""
+
+    noise: Noise = "given"
+    """"inflated" smooths twice: the second time with the noise of ranges, motion or odometry, and
+    sound speed multiplied by what held-out pings ask for, never by less than 1."""
+
     node_spacing: float | None = None
     """Nodes on a regular grid of this spacing, s. Left out: offline at the measurements' times,
     online on the grid that the noise asks for (1 s at the defaults)."""
@@ -204,12 +224,14 @@ class Options:
                 self._check_number(f.name, value, optional="None" in kind, auto="Auto" in kind)
         choices: dict[str, tuple[str, ...]] = {
             "motion": ("constant_velocity", "constant_acceleration", AUTO),
-            "loss": ("cauchy", "huber", "geman_mcclure", "dcs", "none"),
+            "loss": ("cauchy", "huber", "geman_mcclure", "dcs", "tukey", "none"),
             "rays": ("auto", "straight", "eigenray"),
             "solver": ("auto", "gtsam", "banded"),
             "engine": ("lm", "isam2"),
             "node": ("point", "pose2", "pose3"),
             "odometry_noise": ("given", "growing", "both"),
+            "covariance": ("formal", "calibrated"),
+            "noise": ("given", "inflated"),
         }
         for name, allowed in choices.items():
             if getattr(self, name) not in allowed:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -18,6 +19,39 @@ NOMINAL = SoundSpeedProfile.constant(NOMINAL_SPEED)
 
 
 Pings = TwoWayRange | OneWayRange | SlantRange
+
+
+@dataclass(frozen=True)
+class DownWeightedPing:
+    """A ping that the loss took for an outlier, or nearly so.
+
+    Attributes
+    ----------
+    segment : str
+        The segment's label.
+    kind, beacon : str
+        "two_way", "one_way" or "slant", and the name of the beacon.
+    t_transmit, t_receive : float
+        s, as given.
+    residual : float
+        Model minus measurement, s.
+    residual_m : float
+        The same as a distance from the beacon, at 1500 m/s: below zero where the ping came late.
+    sigma : float
+        Standard deviation of the residual, s.
+    weight : float
+        Robust weight; 1 would count in full.
+    """
+
+    segment: str
+    kind: str
+    beacon: str
+    t_transmit: float
+    t_receive: float
+    residual: float
+    residual_m: float
+    sigma: float
+    weight: float
 
 
 def travel_time_model(setup: Setup) -> TravelTimeModel:

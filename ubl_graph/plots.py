@@ -64,6 +64,8 @@ def save_all(result: Result, folder: Path, beside: Beside | None = None) -> None
 def track(result: Result, beside: Beside | None = None) -> Figure:
     """Map of the smoothed track with 95 % ellipses, beacons, and the reference where known.
 
+    Where other tracks fit, too, they are drawn beside it with their weights.
+
     Parameters
     ----------
     result : Result
@@ -80,7 +82,10 @@ def track(result: Result, beside: Beside | None = None) -> Figure:
         colour = COLOURS[i % len(COLOURS)]
         east, north = segment.trajectory.position[:, :2].T
         label = segment.name or "smoothed"
+        if len(segment.hypotheses) > 1:
+            label += f", weight {segment.hypotheses[0].weight:.2g}"
         axes.plot(east, north, color=colour, lw=1.4, label=label, zorder=3)
+        _draw_others(axes, segment, colour)
         label = None if i else "start"
         axes.plot(east[0], north[0], "o", color=colour, mfc="white", label=label, zorder=3.5)
     for name, tracks in (beside or {}).items():
@@ -309,6 +314,15 @@ def _unbroken(angle: FloatArray) -> list[slice]:
     cuts = np.flatnonzero(np.abs(np.diff(angle)) > 180.0) + 1
     ends = [0, *cuts.tolist(), len(angle)]
     return [slice(a, b) for a, b in pairwise(ends)]
+
+
+def _draw_others(axes: Axes, segment: SegmentResult, colour: str) -> None:
+    """Other tracks that fit, dotted, each with its weight."""
+    for other in segment.hypotheses[1:]:
+        east, north = other.trajectory.position[:, :2].T
+        label = f"fits as well, weight {other.weight:.2g}"
+        axes.plot(east, north, color=colour, lw=1.6, ls=":", label=label, zorder=3)
+        axes.plot(east[0], north[0], "o", color=colour, mfc="white", alpha=0.6, zorder=3.5)
 
 
 def _draw_reference(axes: Axes, result: Result) -> None:

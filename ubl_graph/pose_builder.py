@@ -149,7 +149,8 @@ class PoseBuilder(Builder):
     ) -> Antenna:
         """The transducer at each leg's time (M, L)."""
         poses = PosesAt(self.layout, chain, times.ravel())
-        return PoseAntenna(self._tips(poses, self.setup.vehicle.transducer), times.shape[1])
+        off = self.layout.shared_columns("lever_arm") if self.layout.has("lever_arm") else None
+        return PoseAntenna(self._tips(poses, self.setup.vehicle.transducer, off), times.shape[1])
 
     def fix_block(
         self,
@@ -465,11 +466,11 @@ class PoseBuilder(Builder):
             return np.arange(size)
         return np.concatenate([PLANAR + 6 * i for i in range(size // 6)])
 
-    def _tips(self, poses: PosesAt, arm: LeverArm) -> Tips:
+    def _tips(self, poses: PosesAt, arm: LeverArm, off: IntArray | None = None) -> Tips:
         noise = np.zeros(6)
         moving = PLANAR if self.planar else np.arange(6)
         noise[moving] = self.twist_psd[moving]
-        return Tips(poses, arm.body, noise)
+        return Tips(poses, arm.body, noise, off)
 
     def _swing(self, poses: PosesAt) -> FloatArray:
         """Standard deviation of what the prior lets the heading do between nodes, (M,), rad."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -11,11 +11,16 @@ import numpy as np
 from ubl_graph.arrays import BoolArray, FloatArray
 from ubl_graph.errors import ConfigurationError, TimeError
 from ubl_graph.mission import Mission
+from ubl_graph.nodes import NOMINAL_SPEED
+from ubl_graph.pings import DownWeightedPing
 from ubl_graph.trajectory import States, Trajectory
 from ubl_graph.tuning import Tuning
+from ubl_graph.verdict import Consistency
 
 Status = Literal["converged", "not converged", "unobservable"]
 
+#: Where a standard deviation is above this share of the prior's, the data told less than was known.
+OBSERVED = float(np.sqrt(0.5))
 #: A ping whose robust weight is below this counts as down-weighted.
 DOWN_WEIGHTED = 0.5
 
@@ -31,11 +36,21 @@ class SlowState:
     value, sigma : array, shape (N, size)
         Estimate and standard deviation, SI. `sound_speed` is the logarithm of the factor on
         the travel times: the true speed is the given one times exp(-value).
+    prior : array, shape (size,), optional
+        Standard deviations at the first node before any measurement.
     """
 
     t: FloatArray
     value: FloatArray
     sigma: FloatArray
+    prior: FloatArray | None = None
+
+    @property
+    def observed(self) -> bool:
+        """Whether the data tell at least as much of every component as was known before."""
+        return self.prior is None or bool(
+            (np.median(self.sigma, axis=0) <= OBSERVED * self.prior).all()
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,15 +63,37 @@ class Shared:
         Estimate, SI.
     covariance : array, shape (size, size)
         Its covariance; zero where it was not estimated.
+    prior : array, shape (size,), optional
+        Standard deviations before any measurement.
+    expected : array, shape (size, size), optional
+        The covariance that the geometry of the start promised, before anything was solved.
     """
 
     value: FloatArray
     covariance: FloatArray
+    prior: FloatArray | None = None
+    expected: FloatArray | None = None
 
     @property
     def sigma(self) -> FloatArray:
         """Standard deviations, shape (size,)."""
         return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def observed(self) -> bool:
+        """Whether the data tell at least as much in every direction as was known before."""
+        return self._is_observed(self.covariance)
+
+    @property
+    def observable(self) -> bool:
+        """The same of what the geometry of the start promised."""
+        return self.expected is None or self._is_observed(self.expected)
+
+    def _is_observed(self, covariance: FloatArray) -> bool:
+        if self.prior is None:
+            return True
+        of_prior = covariance / (self.prior[:, None] * self.prior)
+        return bool(np.linalg.eigvalsh(of_prior)[-1] <= OBSERVED**2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +143,28 @@ class RangeResiduals:
 
 
 @dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A track that the data allow.
+
+    Attributes
+    ----------
+    trajectory : Trajectory
+        Nodes with covariances, which hold if this is the true one.
+    weight : float
+        Posterior probability among the tracks that were found.
+    cost : float
+        Of its problem.
+    status : str
+        "converged" or "not converged": whether its own solve came to rest.
+    """
+
+    trajectory: Trajectory
+    weight: float
+    cost: float
+    status: Status
+
+
+@dataclass(frozen=True, eq=False)
 class SegmentResult:
     """What smoothing gives for one segment.
 
@@ -137,6 +196,11 @@ class SegmentResult:
     runner_up : float or None
         How much higher the cost of the next best track is that lies elsewhere: of those that were
         solved, else of those that the search for a start compared. None where there was no other.
+    hypotheses : tuple of Hypothesis
+        Tracks that the data allow: this one, then the others, heaviest first. Of a fleet's vehicle
+        there are none: rivals are compared by their cost alone there.
+    pruned : float
+        Weight of the tracks that were found and are too unlikely to be kept.
     """
 
     name: str
@@ -153,6 +217,8 @@ class SegmentResult:
     degrees_of_freedom: int
     rival: FloatArray | None = None
     runner_up: float | None = None
+    hypotheses: tuple[Hypothesis, ...] = ()
+    pruned: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +244,11 @@ class Result:
         Seconds by stage.
     tuning : Tuning or None
         What the data chose where options were "auto"; `mission` holds the numbers.
+    consistency : Consistency or None
+        Whether the sigmas are true, by held-out pings; None where nobody asked.
+    inflation : Consistency or None
+        What held-out pings said before the noise was inflated, where that was asked; `mission`
+        holds the inflated noise.
     """
 
     mission: Mission
@@ -187,6 +258,8 @@ class Result:
     warnings: tuple[str, ...] = ()
     wall_times: dict[str, float] = field(default_factory=dict[str, float])
     tuning: Tuning | None = None
+    consistency: Consistency | None = None
+    inflation: Consistency | None = None
 
     @property
     def status(self) -> Status:
@@ -201,6 +274,11 @@ class Result:
         return "; ".join(parts)
 
     @property
+    def hypotheses(self) -> dict[str, tuple[Hypothesis, ...]]:
+        """Tracks that the data allow, by segment: the answer first, then the heaviest."""
+        return {s.name: s.hypotheses for s in self.segments}
+
+    @property
     def trajectory(self) -> MissionTrajectory:
         """All segments' trajectories as one thing to ask."""
         return MissionTrajectory(self.segments)
@@ -210,6 +288,34 @@ class Result:
         """Range residuals of all segments, or None where there are no ranges."""
         parts = [s.residuals for s in self.segments if s.residuals is not None]
         return RangeResiduals.joined(parts) if parts else None
+
+    @property
+    def down_weighted(self) -> tuple[DownWeightedPing, ...]:
+        """Pings that count for less than half, the one most sigmas off first."""
+        pings = [
+            ping
+            for segment in self.segments
+            if segment.residuals is not None
+            for ping in _down_weighted(segment.name, segment.residuals)
+        ]
+        return tuple(sorted(pings, key=lambda p: -abs(p.residual) / p.sigma))
+
+
+def _down_weighted(segment: str, table: RangeResiduals) -> Iterator[DownWeightedPing]:
+    """A segment's down-weighted pings, in the order of the records."""
+    for i in np.flatnonzero(table.down_weighted):
+        legs = 2.0 if table.kind[i] == "two_way" else 1.0
+        yield DownWeightedPing(
+            segment,
+            str(table.kind[i]),
+            str(table.beacon[i]),
+            float(table.t_transmit[i]),
+            float(table.t_receive[i]),
+            float(table.residual[i]),
+            float(table.residual[i]) * NOMINAL_SPEED / legs,
+            float(table.sigma[i]),
+            float(table.weight[i]),
+        )
 
 
 class MissionTrajectory:

@@ -12,23 +12,23 @@ from dataclasses import dataclass, field, replace
 from ubl_graph.arrays import FloatArray
 from ubl_graph.assembly import assemble_segment, beacons_of, shared_of
 from ubl_graph.builder import SegmentModel
+from ubl_graph.consistency import assess, calibrated, inflated
 from ubl_graph.graph import build_problem, model_segment, shares_unknowns
+from ubl_graph.hypotheses import Basin, judge, settled, weigh
 from ubl_graph.initial import START_LIMIT, Starts
 from ubl_graph.mission import Mission
 from ubl_graph.pose_initial import find_tracks
 from ubl_graph.problem import Problem
 from ubl_graph.result import Result, SegmentResult, Shared
 from ubl_graph.solve.choice import choose
-from ubl_graph.solve.marginals import Marginals
-from ubl_graph.solve.rounds import Engine, Solution, graduated
+from ubl_graph.solve.marginals import Marginals, shared_covariance
+from ubl_graph.solve.rounds import Engine, Solution
 from ubl_graph.track import mirror_images, place, start_vector, track_of, unanchored
 from ubl_graph.tuning import Tuning, tuned
-from ubl_graph.work import Progress, Work, confirmed, down_weighted, rival_of
+from ubl_graph.work import Progress, Work, confirmed
 
 #: Costs nearer than this are equal: two engines, or machines, round differently.
 SAME_COST = 1e-6
-#: Where more pings than this are down-weighted, a graduated solve is tried as well.
-DOUBTFUL_SHARE = 0.01
 #: A profile may end so much above the deepest beacon, as a share of its depth.
 PROFILE_SLACK = 0.1
 #: Outliers are a few per cent; where a fifth of the pings disagree, something else is wrong.
@@ -85,9 +85,25 @@ def smooth(mission: Mission, progress: Progress | None = None) -> Result:
         _judge(work, segment)
     beacons = beacons_of(mission, shared)
     shared = {name: s for name, s in shared.items() if not name.startswith("beacon ")}
-    return Result(
+    result = Result(
         mission, tuple(segments), beacons, shared, tuple(work.warnings), work.wall_times, tuning
     )
+    return _mended(work, result)
+
+
+def _mended(work: _Work, result: Result) -> Result:
+    """The result with what the options ask of held-out pings."""
+    options = result.mission.options
+    if options.noise == "inflated":
+        with work.stage("held-out"):
+            found = assess(result)
+            mission = inflated(result.mission, found)
+        mission = replace(mission, options=replace(mission.options, noise="given"))
+        return replace(smooth(mission), tuning=result.tuning, inflation=found)
+    if options.covariance == "calibrated":
+        with work.stage("held-out"):
+            return calibrated(result)
+    return result
 
 
 def _tune(work: _Work) -> Tuning | None:
@@ -160,17 +176,20 @@ def _smooth_group(
     group = [model for model, _ in searched]
     with work.stage("solve"):
         problem = build_problem(work.mission, group)
-        solution, rivals, solver = _solved(work, problem, group, [s for _, s in searched])
+        expected = _expected(work, problem, [s for _, s in searched])
+        basins, solver = _solved(work, problem, group, [s for _, s in searched])
+    solution = basins[0].solution
     with work.stage("covariance"):
         marginals = Marginals(problem, solution)
         results: list[SegmentResult] = []
         by_model = zip(group, (starts for _, starts in searched), strict=True)
         for chain, (model, starts) in zip(problem.layout.chains, by_model, strict=True):
-            rival, track, runner_up = rival_of(problem, solution, marginals, rivals, chain)
+            verdict = judge(problem, basins, marginals, chain, work.mission.options)
+            runner_up, reason = verdict.runner_up, verdict.reason
             if runner_up is None:
                 runner_up = starts.runner_up
             if len(group) == 1:
-                rival = unanchored(model) or rival
+                reason = unanchored(model) or reason
             results.append(
                 assemble_segment(
                     problem,
@@ -178,27 +197,38 @@ def _smooth_group(
                     marginals,
                     chain,
                     model,
-                    rival,
-                    track,
+                    reason,
+                    verdict.rival,
                     number,
                     solver,
                     runner_up,
                     work.mission.options,
+                    hypotheses=verdict.hypotheses,
+                    pruned=verdict.pruned,
                 )
             )
-        return results, shared_of(problem, solution, marginals)
+        return results, shared_of(problem, solution, marginals, expected)
+
+
+def _expected(work: _Work, problem: Problem, starts: Sequence[Starts]) -> FloatArray | None:
+    """How well the geometry of the start promises to tell what all nodes share."""
+    if not problem.layout.shared:
+        return None
+    begin = start_vector(work.mission, problem.layout, [s.tracks[0] for s in starts])
+    return shared_covariance(problem, begin)
 
 
 def _solved(
     work: _Work, problem: Problem, group: Sequence[SegmentModel], starts: Sequence[Starts]
-) -> tuple[Solution, list[Solution], str]:
-    """The best solution, the others that were found, and who solved it."""
+) -> tuple[list[Basin], str]:
+    """The distinct solutions that were found, the answer first, and who solved it."""
     choice = choose(problem, work.mission.options.solver)
     best, others = _solve_from(work, choice.scout, problem, group, starts)
-    best, solver, note = confirmed(work, choice, best)
+    basins = weigh(problem, [best, *others])
+    best, solver, note = confirmed(work, choice, basins[0].solution)
     for text in filter(None, (choice.note, note)):
         work.warn(group[0].segment.name if len(group) == 1 else "", text)
-    return best, others, solver
+    return settled(basins, best), solver
 
 
 def _search(work: _Work, model: SegmentModel) -> tuple[SegmentModel, Starts]:
@@ -227,10 +257,7 @@ def _solve_from(
     Returns the cheapest solution, and the others, cheapest first.
     """
     begin = start_vector(work.mission, problem.layout, [s.tracks[0] for s in starts])
-    solutions = [work.solve(engine, begin)]
-    if down_weighted(problem, solutions[0]) > DOUBTFUL_SHARE:
-        solutions.append(work.solve(engine, graduated(engine, begin)))
-        solutions.sort(key=lambda s: s.cost)
+    solutions = work.solve_robustly(engine, begin)
     layout = problem.layout
     starts_at: list[FloatArray] = []
     if len(group) == 1:

@@ -12,17 +12,16 @@ import numpy as np
 from ubl_graph.arrays import FloatArray
 from ubl_graph.assembly import direction
 from ubl_graph.errors import SolverError
+from ubl_graph.hypotheses import APART, COVERED_SIGMAS
 from ubl_graph.layout import Chain
-from ubl_graph.problem import LeastSquares, Problem
-from ubl_graph.result import DOWN_WEIGHTED
+from ubl_graph.problem import Problem
 from ubl_graph.solve.choice import Choice
 from ubl_graph.solve.marginals import Covariances
+from ubl_graph.solve.robust import robustly
 from ubl_graph.solve.rounds import Engine, Solution, confirms, solve
 
 #: A second track counts as no worse where its cost is higher by less than this: odds of 20 to 1.
 AMBIGUOUS_COST = 3.0
-#: A second track nearer than so many standard deviations is the same flat valley, not a rival.
-COVERED_SIGMAS = 3.0
 
 #: Called with what is being done and how far the whole is, 0 to 1.
 Progress = Callable[[str, float], None]
@@ -76,6 +75,10 @@ class Work:
 
         return solve(engine, x, self.max_iterations, each)
 
+    def solve_robustly(self, engine: Engine, x: FloatArray) -> list[Solution]:
+        """Solve from `x`, and again where outliers leave doubt; the least cost first."""
+        return robustly(lambda start: self.solve(engine, start), engine, x)
+
 
 def confirmed(work: Work, choice: Choice, found: Solution) -> tuple[Solution, str, str]:
     """The scout's answer, shown to the other engine.
@@ -95,16 +98,6 @@ def confirmed(work: Work, choice: Choice, found: Solution) -> tuple[Solution, st
     return replace(again, iterations=found.iterations + again.iterations), last.name, ""
 
 
-def down_weighted(problem: LeastSquares, solution: Solution) -> float:
-    """Share of the robust rows that count for less than half."""
-    weights = [
-        problem.loss.weights(block.evaluate(solution.x, held, jacobian=False)[0])[:, 0]
-        for block, held in zip(problem.blocks, solution.frozen, strict=True)
-        if block.robust
-    ]
-    return float((np.concatenate(weights) < DOWN_WEIGHTED).mean()) if weights else 0.0
-
-
 def rival_of(
     problem: Problem,
     best: Solution,
@@ -119,7 +112,7 @@ def rival_of(
     """
     runner_up: float | None = None
     sigma = np.sqrt(np.linalg.eigvalsh(marginals.of("position")[chain.nodes])[:, -1])
-    covered = max(1.0, COVERED_SIGMAS * float(np.sqrt(np.mean(sigma**2))))
+    covered = max(APART, COVERED_SIGMAS * float(np.sqrt(np.mean(sigma**2))))
     for other in others:
         here, there = (problem.layout.positions(s.x)[chain.nodes] for s in (best, other))
         gap = here - there

@@ -31,11 +31,11 @@ from ubl_graph.initial import Starts
 from ubl_graph.layout import Layout
 from ubl_graph.pose_states import known_up
 from ubl_graph.result import DOWN_WEIGHTED, Result, Shared
-from ubl_graph.smoother import DOUBTFUL_SHARE, SAME_COST, SUSPICIOUS_CHI_SQUARE, SUSPICIOUS_SHARE
+from ubl_graph.smoother import SAME_COST, SUSPICIOUS_CHI_SQUARE, SUSPICIOUS_SHARE
 from ubl_graph.solve.choice import choose
-from ubl_graph.solve.rounds import Solution, graduated
+from ubl_graph.solve.rounds import Solution
 from ubl_graph.track import Track, start_vector
-from ubl_graph.work import Progress, Work, confirmed, down_weighted
+from ubl_graph.work import Progress, Work, confirmed
 
 #: What lies within this of up 0 is in the plane of vehicles of which nothing else is said, m.
 LEVEL = 1.0
@@ -199,10 +199,7 @@ def _solved(
     )
     for name, found in places.items():
         _place_target(problem, name, found[0], begin)
-    solutions = [work.solve(engine, begin)]
-    if down_weighted(problem, solutions[0]) > DOUBTFUL_SHARE:
-        solutions.append(work.solve(engine, graduated(engine, begin)))
-        solutions.sort(key=lambda s: s.cost)
+    solutions = work.solve_robustly(engine, begin)
     others: list[FloatArray] = []
     for member, place in zip(problem.members, problem.layout.place, strict=True):
         if reckons(member):

@@ -6,12 +6,13 @@ cost, `weights` the factors of iteratively re-weighted least squares. Widths giv
 efficiency on normal noise.
 
 Source: Zhang 1997, Parameter estimation techniques, sect. 9.4; MacTavish and Barfoot 2015 for
-Geman-McClure and DCS as used in SLAM.
+Geman-McClure and DCS as used in SLAM; Yang, Antonante, Tzoumas and Carlone 2020, Graduated
+non-convexity, for the widened losses.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,6 +27,7 @@ WIDTHS: dict[str, float] = {
     "cauchy": 2.3849,
     "geman_mcclure": 3.7874,
     "dcs": 1.8983,
+    "tukey": 4.6851,
 }
 
 
@@ -36,14 +38,26 @@ class RobustLoss:
     Attributes
     ----------
     name : str
-        cauchy, huber, geman_mcclure, dcs or none.
+        cauchy, huber, geman_mcclure, dcs, tukey or none.
+    widening : float
+        Factor on its width. The wider, the farther out it is convex; at 1 it is the loss itself.
     """
 
     name: Loss
+    widening: float = 1.0
+
+    @property
+    def width(self) -> float:
+        """Width in standard deviations."""
+        return self.widening * WIDTHS[self.name]
+
+    def widened(self, factor: float) -> RobustLoss:
+        """The same loss with `factor` times its width."""
+        return replace(self, widening=factor * self.widening)
 
     def cost(self, r: FloatArray) -> FloatArray:
         """rho(r); r^2 / 2 near zero."""
-        c = WIDTHS[self.name]
+        c = self.width
         q = r * r
         match self.name:
             case "none":
@@ -58,10 +72,15 @@ class RobustLoss:
             case "dcs":
                 phi = c * c
                 return np.where(q <= phi, 0.5 * q, phi * (1.5 * q - 0.5 * phi) / (q + phi))
+            case "tukey":
+                # c^2/6 (1 - (1 - u)^3), multiplied out: nothing cancels near zero.
+                inside = np.minimum(q, c * c)
+                u = inside / (c * c)
+                return 0.5 * inside * (1.0 - u + u * u / 3.0)
 
     def weights(self, r: FloatArray) -> FloatArray:
-        """rho'(r) / r, 1 near zero: what a residual still counts."""
-        c = WIDTHS[self.name]
+        """rho'(r) / r, 1 near zero: what a residual still counts, 0 to 1."""
+        c = self.width
         q = r * r
         match self.name:
             case "none":
@@ -74,6 +93,8 @@ class RobustLoss:
                 return 1.0 / (1.0 + q / (c * c)) ** 2
             case "dcs":
                 return np.minimum(1.0, 2.0 * c * c / (q + c * c)) ** 2
+            case "tukey":
+                return np.maximum(1.0 - q / (c * c), 0.0) ** 2
 
     def curvature(self, r: FloatArray) -> FloatArray:
         """What Newton's method weighs a row by: rho''(r), where it is not much below the weight.
@@ -86,7 +107,7 @@ class RobustLoss:
 
     def _second_derivative(self, r: FloatArray) -> FloatArray:
         """rho''(r)."""
-        c = WIDTHS[self.name]
+        c = self.width
         q = r * r
         u = q / (c * c)
         match self.name:
@@ -101,6 +122,8 @@ class RobustLoss:
             case "dcs":
                 phi = c * c
                 return np.where(q <= phi, 1.0, 4.0 * phi**2 * (phi - 3.0 * q) / (q + phi) ** 3)
+            case "tukey":
+                return np.where(u <= 1.0, (1.0 - u) * (1.0 - 5.0 * u), 0.0)
 
     def shaped(self, r: FloatArray) -> FloatArray:
         """sign(r) sqrt(2 rho(r)): half its square is the cost."""

@@ -54,6 +54,21 @@ class Antenna(Protocol):
         ...
 
 
+class Arm(NamedTuple):
+    """What a lever arm is off by, forward-left-up, as an unknown.
+
+    Attributes
+    ----------
+    columns : array of int, shape (3,)
+        Where it stands in the flat vector.
+    rotation : array, shape (M, L, 3, 3)
+        `world_R_body` at each leg's time, where the attitude is held.
+    """
+
+    columns: IntArray
+    rotation: FloatArray
+
+
 class PointAntenna:
     """Transducer on point nodes, whose attitude is held.
 
@@ -67,6 +82,8 @@ class PointAntenna:
         Noise density of the motion prior per axis, for the interpolation's variance.
     variance_factor : array, shape (M * L,)
         Interpolation variance at unit density (`trajectory.interpolation_variance`).
+    arm : Arm, optional
+        What the lever arm is off by, where that is an unknown.
     """
 
     def __init__(
@@ -75,21 +92,33 @@ class PointAntenna:
         lever: FloatArray,
         psd: FloatArray,
         variance_factor: FloatArray,
+        arm: Arm | None = None,
     ) -> None:
         m, self.legs = lever.shape[:2]
         self._columns, self._weights = by_leg(position, m, self.legs)
-        self._lever = lever
+        self._lever, self._arm = lever, arm
         self._variance = variance_factor.reshape(m, self.legs, 1) * psd
         self.columns = self._columns.reshape(m, -1)
+        if arm is not None:
+            off = np.broadcast_to(arm.columns, (m, 3))
+            self.columns = np.concatenate([self.columns, off], axis=1)
 
     def positions(self, x: FloatArray, rows: slice) -> tuple[FloatArray, None]:
         """Positions (m, L, 3) at `x`, m."""
         columns, weights = self._columns[rows], self._weights[rows]
-        return (x[columns] * weights[..., None]).sum(axis=2) + self._lever[rows], None
+        place = (x[columns] * weights[..., None]).sum(axis=2) + self._lever[rows]
+        if self._arm is not None:
+            place = place + self._arm.rotation[rows] @ x[self._arm.columns]
+        return place, None
 
     def slopes(self, gradient: FloatArray, terms: None, rows: slice) -> FloatArray:  # noqa: ARG002 - the protocol's form
         """Derivatives (m, W) by the columns, given those by the positions (m, L, 3)."""
-        return (gradient[:, :, None, :] * self._weights[rows][..., None]).reshape(len(gradient), -1)
+        by_nodes = gradient[:, :, None, :] * self._weights[rows][..., None]
+        own = by_nodes.reshape(len(gradient), -1)
+        if self._arm is None:
+            return own
+        off = np.einsum("mli,mlij->mj", gradient, self._arm.rotation[rows])
+        return np.concatenate([own, off], axis=1)
 
     def variance(self, gradient: FloatArray, terms: None) -> FloatArray:  # noqa: ARG002 - the protocol's form
         """Variance of the motion between the nodes along the gradients, (M,).
@@ -173,8 +202,9 @@ class RangeBlock:
         Its standard deviation, s.
     sound_speed : Interpolation, optional
         Of the log scale at each leg's time (M * L rows, one component).
-    clock : Interpolation, optional
-        Of the clock offset at the receive time, receiver's minus sender's (M rows, one component).
+    offset : Interpolation, optional
+        What is added to the sum (M rows, one component): the clock offset at the receive time,
+        receiver's minus sender's, and a beacon's range bias.
     """
 
     linear = False
@@ -191,7 +221,7 @@ class RangeBlock:
         measured: FloatArray,
         sigma: FloatArray,
         sound_speed: Interpolation | None = None,
-        clock: Interpolation | None = None,
+        offset: Interpolation | None = None,
     ) -> None:
         self.name = name
         self.chain = chain
@@ -201,8 +231,8 @@ class RangeBlock:
         self.antenna, self._there = here, there
         m, n_legs = len(measured), here.legs
         self._sound_speed = None if sound_speed is None else by_leg(sound_speed, m, n_legs)
-        self._clock = None if clock is None else by_leg(clock, m, 1)
-        slow = [part for part in (self._sound_speed, self._clock) if part is not None]
+        self._offset = None if offset is None else by_leg(offset, m, 1)
+        slow = [part for part in (self._sound_speed, self._offset) if part is not None]
         parts = [here.columns, *(part[0].reshape(m, -1) for part in slow), there.columns]
         self.columns = np.concatenate(parts, axis=1)
 
@@ -241,8 +271,8 @@ class RangeBlock:
         parts = [self.antenna.slopes(terms.slopes, terms.here, rows)]
         if self._sound_speed is not None:
             parts.append((terms.times[..., None] * self._sound_speed[1][rows]).reshape(m, -1))
-        if self._clock is not None:
-            parts.append(self._clock[1][rows].reshape(m, -1))
+        if self._offset is not None:
+            parts.append(self._offset[1][rows].reshape(m, -1))
         if self._there.columns.shape[1]:
             parts.append(self._there.slopes(terms.back, terms.there, rows))
         jacobians = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
@@ -261,8 +291,8 @@ class RangeBlock:
             times = times * scale
             slopes, back = slopes * scale[..., None], back * scale[..., None]
         total = times.sum(axis=1)
-        if self._clock is not None:
-            columns, weights = self._clock[0][rows], self._clock[1][rows]
+        if self._offset is not None:
+            columns, weights = self._offset[0][rows], self._offset[1][rows]
             total = total + (x[columns[..., 0]] * weights).sum(axis=(1, 2))
         return _Terms(total, times, slopes, back, travel, held, held_there)
 

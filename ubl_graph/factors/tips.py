@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -105,6 +106,24 @@ class PoseSlopes:
         return self.of.to_columns(self.ends, self.by_end, left)
 
 
+class TipTerms(NamedTuple):
+    """What gives the derivatives of points fixed to the vehicle.
+
+    Attributes
+    ----------
+    rotation : array, shape (m, 3, 3)
+        `world_R_body`.
+    slopes : PoseSlopes
+        Of the poses.
+    cross : array, shape (3, 3) or (m, 3, 3)
+        The cross-product matrix of the arm, or of each, body axes.
+    """
+
+    rotation: FloatArray
+    slopes: PoseSlopes
+    cross: FloatArray
+
+
 class Tips:
     """Points fixed to the vehicle, at any times.
 
@@ -116,35 +135,45 @@ class Tips:
         Reference point to the point, body axes, m.
     psd : array, shape (6,)
         Noise density of the motion along and about the body's axes.
+    off : array of int, shape (3,), optional
+        Where what `arm` is off by (body axes, m) stands in the flat vector.
     """
 
-    def __init__(self, poses: PosesAt, arm: FloatArray, psd: FloatArray) -> None:
-        self._poses, self._arm = poses, arm
+    def __init__(
+        self, poses: PosesAt, arm: FloatArray, psd: FloatArray, off: IntArray | None = None
+    ) -> None:
+        self._poses, self._arm, self._off = poses, arm, off
         self._cross = lie.cross_matrix(arm[None])[0]
-        self._has_arm = bool(arm.any())
+        self._has_arm = off is not None or bool(arm.any())
         noise = np.diag(psd[:3]) + self._cross @ np.diag(psd[3:]) @ self._cross.T
         self._noise = poses.variance_factor[:, None, None] * noise
         level = np.array([0.5 * (noise[0, 0] + noise[1, 1])] * 2 + [noise[2, 2]])
         self._level = poses.variance_factor[:, None] * level
         self.columns = poses.columns
+        if off is not None:
+            columns = np.broadcast_to(off, (len(poses.columns), 3))
+            self.columns = np.concatenate([poses.columns, columns], axis=1)
 
-    def at(self, x: FloatArray, rows: slice) -> tuple[FloatArray, tuple[FloatArray, PoseSlopes]]:
-        """Points (m, 3), m, and what gives their derivatives: rotations and slopes of the poses."""
+    def at(self, x: FloatArray, rows: slice) -> tuple[FloatArray, TipTerms]:
+        """Points (m, 3), m, and what gives their derivatives."""
         position, rotation, slopes = self._poses.at(x, rows)
+        cross = self._cross
         if self._has_arm:
-            position = position + rotation @ self._arm
-        return position, (rotation, slopes)
+            arm = self._arm if self._off is None else self._arm + x[self._off]
+            cross = cross if self._off is None else lie.cross_matrix(arm[None])[0]
+            position = position + rotation @ arm
+        return position, TipTerms(rotation, slopes, cross)
 
-    def slopes(self, left: FloatArray, terms: tuple[FloatArray, PoseSlopes]) -> FloatArray:
+    def slopes(self, left: FloatArray, terms: TipTerms) -> FloatArray:
         """Derivatives (m, R, C) of what changes by `left` (m, R, 3) as the points move."""
-        rotation, slopes = terms
-        moved = left @ rotation
-        turned = -moved @ self._cross if self._has_arm else np.zeros_like(moved)
-        return slopes.to_columns(np.concatenate([moved, turned], axis=2))
+        moved = left @ terms.rotation
+        turned = -moved @ terms.cross if self._has_arm else np.zeros_like(moved)
+        by_poses = terms.slopes.to_columns(np.concatenate([moved, turned], axis=2))
+        return by_poses if self._off is None else np.concatenate([by_poses, moved], axis=2)
 
-    def variance(self, terms: tuple[FloatArray, PoseSlopes]) -> FloatArray:
+    def variance(self, terms: TipTerms) -> FloatArray:
         """Covariance of the points' motion between the nodes, world axes, (M, 3, 3), m^2."""
-        rotation, _ = terms
+        rotation = terms.rotation
         return rotation @ self._noise @ np.swapaxes(rotation, 1, 2)
 
     @property
@@ -168,9 +197,7 @@ class PoseAntenna:
         self.legs, self._tips = legs, tips
         self.columns = tips.columns.reshape(-1, legs * tips.columns.shape[1])
 
-    def positions(
-        self, x: FloatArray, rows: slice
-    ) -> tuple[FloatArray, tuple[FloatArray, PoseSlopes]]:
+    def positions(self, x: FloatArray, rows: slice) -> tuple[FloatArray, TipTerms]:
         """Positions (m, L, 3) at `x`, m."""
         every = slice(
             None if rows.start is None else rows.start * self.legs,
@@ -182,14 +209,14 @@ class PoseAntenna:
     def slopes(
         self,
         gradient: FloatArray,
-        terms: tuple[FloatArray, PoseSlopes],
+        terms: TipTerms,
         rows: slice,  # noqa: ARG002 - the protocol's form
     ) -> FloatArray:
         """Derivatives (m, W) by the columns, given those by the positions (m, L, 3)."""
         slopes = self._tips.slopes(gradient.reshape(-1, 1, 3), terms)
         return slopes.reshape(len(gradient), -1)
 
-    def variance(self, gradient: FloatArray, terms: tuple[FloatArray, PoseSlopes]) -> FloatArray:
+    def variance(self, gradient: FloatArray, terms: TipTerms) -> FloatArray:
         """Variance of the motion between the nodes along the gradients, (M,)."""
         along = gradient.reshape(-1, 3)
         variance = np.einsum("mi,mij,mj->m", along, self._tips.variance(terms), along)

@@ -16,17 +16,25 @@ from typing import Any
 
 import numpy as np
 
-from ubl_graph.arrays import BoolArray, FloatArray
+from ubl_graph.arrays import BoolArray, FloatArray, IntArray
 from ubl_graph.beacon import Beacon
 from ubl_graph.errors import ConfigurationError, DataError
 from ubl_graph.frames import GeodeticOrigin, LeverArm, world_R_body
 from ubl_graph.io.records import degrees
 from ubl_graph.io.tables import Table, did_you_mean, naming, read_table, read_text, shortened
-from ubl_graph.measurements import MAX_DISTANCE, TRAVEL_TIME_SIGMA, Depth, TwoWayRange
+from ubl_graph.measurements import (
+    MAX_DISTANCE,
+    TRAVEL_TIME_SIGMA,
+    Depth,
+    PositionFix,
+    TwoWayRange,
+)
 from ubl_graph.mission import Reference, Segment
 
 #: Standard deviation of the transducer's depth, m: kinematic GNSS heave.
 GARPOS_DEPTH_SIGMA = 0.05
+#: The same of its east, north and up where the ship's track serves as data, m.
+GARPOS_TRACK_SIGMA = (0.02, 0.02, GARPOS_DEPTH_SIGMA)
 #: Options of a garpos mission where the user gives none: a surface vessel heaves.
 GARPOS_OPTIONS: dict[str, Any] = {"vertical_acceleration_psd": 0.3}
 
@@ -171,6 +179,7 @@ def read_garpos(
     beacons: str | Path | None = None,
     lines: Sequence[str] | None = None,
     sigma: float = TRAVEL_TIME_SIGMA,
+    known_track: bool = False,
 ) -> Campaign:
     """Read a campaign.
 
@@ -187,6 +196,9 @@ def read_garpos(
         "SET/LN" of the lines to take, in this order; left out, all in order of appearance.
     sigma : float
         Standard deviation of a travel time, s.
+    known_track : bool
+        Whether the ship's track is data, for a survey of the beacons: fixes of the transducer at
+        transmit and receive times take the place of its depths and of the reference.
 
     Returns
     -------
@@ -205,7 +217,8 @@ def read_garpos(
         stations |= read_beacons(beacons)
     arm = settings.lever_arm
     segments = tuple(
-        _segment(name, table, arm, sigma) for name, table in _lines(observations, lines).items()
+        _segment(name, table, arm, sigma, known_track)
+        for name, table in _lines(observations, lines).items()
     )
     return Campaign(segments, tuple(stations.values()), settings.origin)
 
@@ -288,13 +301,16 @@ def _flags(table: Table) -> BoolArray:
     return np.array(flags, dtype=np.bool_)
 
 
-def _segment(name: str, table: Table, arm: FloatArray, sigma: float) -> Segment:
+def _segment(name: str, table: Table, arm: FloatArray, sigma: float, known_track: bool) -> Segment:
     sent, heard = (table.finite(column) for column in _TIMES)
     with naming(table.file, columns=IN_FILE):
         ranges = TwoWayRange(
             table.text("MT"), sent, heard, table.finite("TT"), sigma, source=table.source
         )
     at_sent, at_heard = (_transducer(table, columns, arm) for columns in _POSES)
+    if known_track:
+        fixes = _fixes(table, (sent, heard), (at_sent, at_heard))
+        return Segment(name=name, two_way_range=ranges, position=fixes)
     order = np.argsort(sent, kind="stable")
     return Segment(
         name=name,
@@ -322,7 +338,26 @@ def _depths(
     times: tuple[FloatArray, FloatArray],
     positions: tuple[FloatArray, FloatArray],
 ) -> Depth:
-    # A reply may arrive in the instant of another ping: one time, one depth.
+    t, position, rows = _instants(times, positions)
+    return Depth(t, -position[:, 2], GARPOS_DEPTH_SIGMA, source=table.source[rows])
+
+
+def _fixes(
+    table: Table,
+    times: tuple[FloatArray, FloatArray],
+    positions: tuple[FloatArray, FloatArray],
+) -> PositionFix:
+    t, position, rows = _instants(times, positions)
+    covariance = np.diag(np.square(GARPOS_TRACK_SIGMA))
+    return PositionFix(t, *position.T, covariance=covariance, source=table.source[rows])
+
+
+def _instants(
+    times: tuple[FloatArray, FloatArray], positions: tuple[FloatArray, FloatArray]
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Times at which the transducer's place is stated, the places (N, 3), and the table's rows.
+
+    A reply may arrive in the instant of another ping: one time, one place.
+    """
     t, first = np.unique(np.stack(times, axis=1).ravel(), return_index=True)
-    depth = -np.stack([p[:, 2] for p in positions], axis=1).ravel()
-    return Depth(t, depth[first], GARPOS_DEPTH_SIGMA, source=table.source[first // 2])
+    return t, np.stack(positions, axis=1).reshape(-1, 3)[first], first // 2

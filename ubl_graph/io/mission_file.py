@@ -35,13 +35,16 @@ from ubl_graph.mission_checks import RANGE_KINDS
 from ubl_graph.options import Options
 
 
-def load_mission(path: str | Path) -> Mission:
+def load_mission(path: str | Path, known_track: bool = False) -> Mission:
     """Read a mission file and the data files that it names.
 
     Parameters
     ----------
     path : path
         TOML file; docs/mission-file.md lists its keys. Relative paths in it start at its folder.
+    known_track : bool
+        Whether the ship's track of a garpos mission is data, for a survey of its beacons
+        (`ubl_graph.survey.calibrate`), and no reference to compare with.
 
     Returns
     -------
@@ -61,7 +64,7 @@ def load_mission(path: str | Path) -> Mission:
     _refuse_fleet(content, path, "load_fleet reads it; `ubl-graph smooth` smooths one at a time")
     document = validated(content, path)
     if isinstance(document, GarposDocument):
-        return _garpos_mission(document, path)
+        return _garpos_mission(document, path, known_track)
     if isinstance(document, PyfgDocument):
         return _pyfg_mission(document, path)
     return _csv_mission(document, path)
@@ -126,7 +129,7 @@ def _refuse_fleet(content: dict[str, Any], path: Path, remedy: str) -> None:
         )
 
 
-def _garpos_mission(document: GarposDocument, path: Path) -> Mission:
+def _garpos_mission(document: GarposDocument, path: Path, known_track: bool) -> Mission:
     data, folder = document.data, path.parent
     with naming(path, "options."):
         options = Options(**{**GARPOS_OPTIONS, **document.options.given()})
@@ -137,6 +140,7 @@ def _garpos_mission(document: GarposDocument, path: Path) -> Mission:
             None if data.beacons is None else folder / data.beacons,
             data.lines,
             options.settled.number("travel_time_sigma"),
+            known_track,
         )
     if isinstance(data.sound_speed, str):
         profile = records.read_sound_speed(folder / data.sound_speed)

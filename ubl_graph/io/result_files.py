@@ -32,8 +32,16 @@ from ubl_graph.io.pose_columns import (
 from ubl_graph.io.resolved import resolved
 from ubl_graph.mission import Mission
 from ubl_graph.pose_trajectory import PoseTrajectory
-from ubl_graph.result import RangeResiduals, Result, SegmentResult, SlowState
+from ubl_graph.result import (
+    Hypothesis,
+    RangeResiduals,
+    Result,
+    SegmentResult,
+    Shared,
+    SlowState,
+)
 from ubl_graph.trajectory import Trajectory
+from ubl_graph.verdict import Consistency
 
 #: Columns of trajectory.csv; docs/outputs.md says what they hold.
 TRAJECTORY_COLUMNS = (
@@ -44,6 +52,8 @@ RESIDUAL_COLUMNS = (
     *("segment", "kind", "beacon", "t_transmit", "t_receive", "travel_time"),
     *("residual", "sigma", "weight", "direct_ray"),
 )
+#: Down-weighted pings that result.json lists; residuals.csv has them all.
+MOST_LISTED = 100
 #: Components of the slow states as slow_states.csv names them.
 SLOW_COMPONENTS = {
     "sound_speed": ("sound_speed_log_factor",),
@@ -122,19 +132,22 @@ def summary(result: Result) -> dict[str, Any]:
         "iterations": sum(s.iterations for s in _problems(result)),
         "chi_square_per_dof": chi_square / max(dof, 1),
         "pings": {} if residuals is None else _ping_counts(residuals),
+        "down_weighted": _down_weighted(result),
         "beacons": {
             name: {"enu": b.value.tolist(), "sigma_enu": b.sigma.tolist()}
             for name, b in result.beacons.items()
         },
-        "shared_states": {
-            name: {"value": s.value.tolist(), "sigma": s.sigma.tolist()}
-            for name, s in result.shared.items()
-        },
+        "shared_states": {name: _shared_summary(s) for name, s in result.shared.items()},
         "segments": [
             {**segment_summary(s, errors.get(s.name)), **_odometry_noise(result.mission, s.name)}
             for s in result.segments
         ],
         **({} if result.tuning is None else {"tuning": asdict(result.tuning)}),
+        **{
+            name: _consistency_summary(found)
+            for name in ("consistency", "inflation")
+            if (found := getattr(result, name)) is not None
+        },
         "wall_times_s": {name: round(t, 4) for name, t in result.wall_times.items()},
         "versions": versions(),
     }
@@ -172,6 +185,8 @@ def segment_summary(segment: SegmentResult, errors: Errors | None) -> dict[str, 
         "solver": segment.solver,
         "cost": segment.cost,
         "runner_up": segment.runner_up,
+        "hypotheses": [_hypothesis_summary(segment, h) for h in segment.hypotheses],
+        "pruned_weight": segment.pruned,
         "iterations": segment.iterations,
         "chi_square_per_dof": segment.chi_square / max(segment.degrees_of_freedom, 1),
         "median_sd_m": dict(zip(("east", "north", "up"), np.median(sd, axis=0), strict=True)),
@@ -185,6 +200,20 @@ def segment_summary(segment: SegmentResult, errors: Errors | None) -> dict[str, 
     return content
 
 
+def _hypothesis_summary(segment: SegmentResult, told: Hypothesis) -> dict[str, Any]:
+    """Weight of a track that the data allow, where it begins and ends, how far off it runs."""
+    track = told.trajectory
+    gap = track.position - segment.trajectory.position
+    return {
+        "weight": told.weight,
+        "cost": told.cost,
+        "status": told.status,
+        "first_enu": track.position[0].tolist(),
+        "last_enu": track.position[-1].tolist(),
+        "rms_apart_m": float(np.sqrt(np.mean(np.sum(gap**2, axis=1)))),
+    }
+
+
 def _odometry_noise(mission: Mission, name: str) -> dict[str, str]:
     """Which noise a segment's odometry records were given; nothing where there are none."""
     for segment in mission.segments:
@@ -195,12 +224,30 @@ def _odometry_noise(mission: Mission, name: str) -> dict[str, str]:
     return {}
 
 
+def _consistency_summary(found: Consistency) -> dict[str, Any]:
+    low, high = found.interval
+    content = {"verdict": found.verdict, "agrees": found.agrees, **asdict(found)}
+    return content if found.trouble else {**content, "factor_low": low, "factor_high": high}
+
+
+def _shared_summary(state: Shared) -> dict[str, Any]:
+    content: dict[str, Any] = {"value": state.value.tolist(), "sigma": state.sigma.tolist()}
+    if state.prior is not None:
+        content |= {"prior_sigma": state.prior.tolist(), "observed": state.observed}
+    if state.expected is not None:
+        expected = np.sqrt(np.diag(state.expected))
+        content |= {"expected_sigma": expected.tolist(), "observable": state.observable}
+    return content
+
+
 def _slow_summary(state: SlowState) -> dict[str, Any]:
     return {
         "mean": state.value.mean(axis=0).tolist(),
         "first": state.value[0].tolist(),
         "last": state.value[-1].tolist(),
         "median_sigma": np.median(state.sigma, axis=0).tolist(),
+        "prior_sigma": None if state.prior is None else state.prior.tolist(),
+        "observed": state.observed,
     }
 
 
@@ -212,6 +259,26 @@ def _ping_counts(residuals: RangeResiduals) -> dict[str, dict[str, int]]:
         }
         for name in np.unique(residuals.beacon)
     }
+
+
+def _down_weighted(result: Result) -> dict[str, Any]:
+    """How many pings are down-weighted, and the worst of them one by one."""
+    found = result.down_weighted
+    worst = [
+        {
+            "segment": p.segment,
+            "kind": p.kind,
+            "beacon": p.beacon,
+            "t_transmit": p.t_transmit,
+            "t_receive": p.t_receive,
+            "residual_s": p.residual,
+            "residual_m": p.residual_m,
+            "sigma_s": p.sigma,
+            "weight": p.weight,
+        }
+        for p in found[:MOST_LISTED]
+    ]
+    return {"count": len(found), "worst": worst}
 
 
 def _trajectory_rows(result: Result) -> Iterator[list[str]]:

@@ -27,6 +27,8 @@ from ubl_graph.mission import Setup, Start, Vehicle
 from ubl_graph.online.buffer import Entry, columns_of, odometry_of
 from ubl_graph.online.frame import Break
 from ubl_graph.online.gate import MEMORY, Gate
+from ubl_graph.online.keeper import Rival
+from ubl_graph.online.revision import Reviser
 from ubl_graph.online.state import Moment
 from ubl_graph.options import Options
 
@@ -115,6 +117,10 @@ def _told(estimator: FixedLagEstimator) -> dict[str, Any]:
         "setup": _setup_told(estimator.setup),
         "start": None if core.start is None else asdict(core.start),
         "tracker": _tracker_told(core.tracker),
+        "rivals": [
+            {"tracker": _tracker_told(r.tracker), "weight": r.weight, "agrees": r.agrees}
+            for r in core.rivals
+        ],
         "clock": {
             "now": core.clock.now,
             "newest": [[*stream, t] for stream, t in core.clock.newest.items()],
@@ -139,6 +145,10 @@ def _restored(cls: type[FixedLagEstimator], told: dict[str, Any]) -> FixedLagEst
     core = estimator.core
     core.start = None if told["start"] is None else Start(**told["start"])
     _restore_tracker(core.tracker, told["tracker"])
+    for rival in told.get("rivals", []):
+        twin = Reviser(core.setup)
+        _restore_tracker(twin, rival["tracker"])
+        core.rivals.append(Rival(twin, rival["weight"], rival["agrees"]))
     core.clock.now = told["clock"]["now"]
     core.clock.newest = {(kind, name): t for kind, name, t in told["clock"]["newest"]}
     entries = list(core.tracker.buffer.all())
@@ -232,6 +242,9 @@ def _tracker_told(tracker: Tracker) -> dict[str, Any]:
         "horizontal_sigma": tracker.horizontal_sigma,
         "rebuilds": tracker.rebuilds,
         "kinds": sorted(tracker.kinds),
+        "fresh": tracker.is_fresh,
+        "weighed": tracker.is_weighed,
+        "past": tracker.past,
         "window": None,
     }
     if window is not None:
@@ -262,6 +275,9 @@ def _restore_tracker(tracker: Tracker, told: dict[str, Any]) -> None:
     tracker.located, tracker.rebuilds = told["located"], told["rebuilds"]
     tracker.kinds = set(told["kinds"])
     tracker.horizontal_sigma = told["horizontal_sigma"]
+    # Checkpoints of before tracks were weighed do not say: what has left them is not known.
+    tracker.is_fresh, tracker.past = told.get("fresh", False), told.get("past", 0.0)
+    tracker.is_weighed = told.get("weighed", False)
     window = told["window"]
     if window is None:
         return

@@ -162,6 +162,7 @@ class Core(Finder):
         """Move what is known back with the clock, and take the run of records behind it."""
         clock, tracker = self.clock, self.tracker
         assert clock.now is not None
+        self.forget_rivals()
         refused: list[Entry] = []
         for entry in run:
             if tracker.buffer.twin(entry) is entry:
@@ -210,19 +211,23 @@ class Core(Finder):
         else:
             self.tracker.insert(entry)
             gate.accept(entry)
+        self.follow(entry)
         self._advance()
         return Outcome(not entry.gated, entry.reason, not entry.gated)
 
     def _leap_to(self, entry: Entry) -> None:
         window = self.tracker.window
         if window is not None and entry.begin < window.begin:
-            self.tracker.begin_at(entry.begin)
+            for tracker in (self.tracker, *(r.tracker for r in self.rivals)):
+                tracker.begin_at(entry.begin)
         now = self.clock.now
         assert now is not None
         # The replies of other pings may have begun their flight as early as this one's.
         begin = min(entry.begin, now) - LEAP_SLACK - (entry.t - entry.begin)
         if window is not None and begin - window.end > self.setup.options.lag:
             self.guarded(lambda: self.tracker.leap(begin))
+            for rival in list(self.rivals):
+                self._each(rival, lambda tracker: tracker.leap(begin))
 
     def _advance(self) -> None:
         """Move the window on where there was no ping for a while."""
@@ -292,6 +297,7 @@ class Core(Finder):
             self.noted("depth: the estimate was moved to what the sensor says", run[-1].t + 10.0)
         for entry in run:
             self.tracker.regate(entry, False)
+            self.regate_rivals(entry)
         self.readmitted(run, "five in a row agree with each other")
 
     def _take_absolute(self, entry: Entry) -> Outcome:
@@ -308,7 +314,9 @@ class Core(Finder):
             gate.accept(entry)
             self.find(now)
         else:
+            self.follow(entry)
             self._judge_absolute(entry, gate)
+            self.weigh("another track fits better")
             self.confirm(now)
         self.state.moment = None
         self.latency.note(perf_counter() - begin, since)
@@ -328,9 +336,17 @@ class Core(Finder):
             self.state.lost_at = entry.begin
             self.find(entry.t)
             return
+        elsewhere = any(rival.agrees for rival in self.rivals)
+        if away > limit(dof) and elsewhere and entry.kind not in PINGS:
+            # It tells for another track: this one pays for the difference.
+            gate.accept(entry)
+            self.tracker.regate(entry, False)
+            self.guarded(self.tracker.solve)
+            return
         if away > limit(dof) and entry.kind == "set_position":
             # Who sets a position knows better than the track.
             gate.accept(entry)
+            self.forget_rivals()
             if self.guarded(lambda: self.tracker.jump_to([entry], anyway=True)):
                 self.after_rebuild("the position was set")
                 self.regated()
@@ -338,7 +354,8 @@ class Core(Finder):
         if away > limit(dof):
             self.tracker.regate(entry, True, f"gated: {away:.1f} sigma from what is expected")
             gate.refuse(entry)
-            self.reopen(gate, entry.t)
+            if not elsewhere:
+                self.reopen(gate, entry.t)
             return
         gate.accept(entry, away * away / dof)
         self.guarded(lambda: self.tracker.solve(afar=self.tracker.is_wide))

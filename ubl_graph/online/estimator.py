@@ -225,7 +225,15 @@ class FixedLagEstimator:
             pose = pose.copy()
             pose[:3, :3] = covariance[:3, :3]
         return Estimate(
-            stamp, position, velocity, covariance, status, reasons, moment.rotation, pose
+            stamp,
+            position,
+            velocity,
+            covariance,
+            status,
+            reasons,
+            moment.rotation,
+            pose,
+            self.core.places(moment),
         )
 
     def smoothed(self, t: float | FloatArray) -> States:
@@ -242,7 +250,7 @@ class FixedLagEstimator:
             Where a time is outside the window, or there is no position yet.
         """
         states = self.window().at(t)
-        wide = self.core.ambiguity(states.position)
+        wide = self.core.ambiguity(states.position, states.t)
         return states if wide is None else replace(states, covariance=states.covariance + wide)
 
     def window(self) -> Trajectory:

@@ -10,13 +10,15 @@ from ubl_graph.arrays import FloatArray
 from ubl_graph.mission import Start
 from ubl_graph.online.buffer import ABSOLUTE, PINGS, Entry
 from ubl_graph.online.gate import REOPENS, Gate, distance, limit
-from ubl_graph.online.keeper import Keeper
 from ubl_graph.online.outputs import Event
 from ubl_graph.online.pose_gap import with_heading
+from ubl_graph.online.rivals import Rivals
 from ubl_graph.online.search import Found
 
 #: A track found first is put to the test so long after, s, and when the window is full.
-CONFIRMED_AFTER = (5.0, 10.0, 20.0, 40.0)
+CONFIRMED_AFTER = (2.5, 5.0, 10.0, 20.0, 40.0)
+#: A lone beacon's track is put to the test again after such a part of its age.
+LOOKS = 4.0
 #: Tracks nearer to each other than this are one, m.
 APART = 20.0
 #: Fixes that leave the position open by more than this say nothing, m.
@@ -25,7 +27,7 @@ FREE_SIGMA = 1e4
 ENOUGH = 6
 
 
-class Finder(Keeper):
+class Finder(Rivals):
     """Looks for the position, and puts it in question."""
 
     def find(self, now: float) -> None:
@@ -46,12 +48,15 @@ class Finder(Keeper):
                 state.waiting = found.reason
             return
         again = state.located
+        self.forget_rivals()
         adopted = self.guarded(lambda: tracker.adopt(found, anew=True))
         if not adopted:
             return
         self._begin_track(now)
         self._doubt(found)
         self.regated()
+        if tracker.is_fresh and not found.is_open:
+            self._carry(found)
         if again:
             self.after_rebuild("the position was found anew")
 
@@ -75,8 +80,9 @@ class Finder(Keeper):
         return True
 
     def _prior(self, now: float) -> Start | None:
-        """What is known of the position where it was lost."""
-        if not self.state.located:
+        """What is known of the position where it was lost, beyond what a search looks at."""
+        if not self.state.located or self.tracker.is_fresh:
+            # All of it came from the records that are searched: it would count twice.
             return None
         moment = self.recent()
         if moment is None:
@@ -91,18 +97,40 @@ class Finder(Keeper):
         start = Start(now, float(east), float(north), float(up), sigma)
         return start if moment.rotation is None else with_heading(start, moment, dt)
 
+    def _carry(self, found: Found) -> None:
+        """Carry all tracks that a search found; their weights say what is doubtful."""
+        self.state.ambiguous, self.state.rival = "", None
+        self.spawn(found)
+
+    def _is_due(self, now: float) -> bool:
+        """Whether the track is to be put to the test."""
+        state, tracker = self.state, self.tracker
+        if state.confirm and now >= state.confirm[0]:
+            return True
+        since, pause = now - state.searched_at, self.setup.options.lag / 8.0
+        if self.rivals or since < pause:
+            return False
+        if state.ambiguous:
+            return True
+        # Two tracks about one beacon may part while nothing is linearised for good.
+        if not tracker.is_fresh or since < max(pause, (now - state.located_at) / LOOKS):
+            return False
+        return len({e.values[0] for kind in PINGS for e in tracker.buffer.of(kind)}) == 1
+
     def confirm(self, now: float) -> None:
         """Put a young or ambiguous track to the test: a search may find a better one."""
         state, tracker = self.state, self.tracker
-        due = bool(state.confirm) and now >= state.confirm[0]
-        if state.ambiguous and now - state.searched_at >= self.setup.options.lag / 8.0:
-            due = True
-        if not due or not state.located:
+        if not state.located or not self._is_due(now):
             return
         state.confirm = [t for t in state.confirm if t > now]
+        if self.rivals and not tracker.is_fresh:
+            return
         state.searched_at = now
         found = tracker.search()
         if not found.usable:
+            return
+        if tracker.is_fresh and not found.is_open:
+            self._carry(found)
             return
         if self.guarded(lambda: tracker.adopt(found)):
             self.after_rebuild("a better track was found")
@@ -110,7 +138,7 @@ class Finder(Keeper):
         elif not found.ambiguous and (gap := self._apart(found)) is not None:
             away = float(np.hypot(*gap[:2]))
             state.ambiguous = f"ambiguous: the last pings alone ask for a place {away:.0f} m away"
-            state.rival = gap
+            state.rival, state.rival_weight = gap, 0.5
             return
         self._doubt(found)
 
@@ -129,6 +157,7 @@ class Finder(Keeper):
             doubtful = bool(self.state.ambiguous)
         self.state.ambiguous = found.reason if doubtful else ""
         self.state.rival = found.rival if doubtful else None
+        self.state.rival_weight = found.rival_weight
 
     def _apart(self, found: Found) -> FloatArray | None:
         """How far a found track ends from the present one, m; None where its sigmas cover that."""
@@ -156,6 +185,7 @@ class Finder(Keeper):
         jump = self.tracker.break_at if pings else self.tracker.jump_to
         if not self.guarded(lambda: jump(here)):
             return
+        self.forget_rivals()
         told = "pings" if pings else "fixes"
         self.after_rebuild(f"the {told} contradicted the track")
         if not pings:

@@ -7,7 +7,6 @@ node's number whose it is: so that one block holds all rows of a kind, whoever m
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from ubl_graph import lie
 from ubl_graph.arrays import FloatArray, IntArray
 from ubl_graph.factors.block import ALL_ROWS, CurvedBlock
 from ubl_graph.factors.poses import PoseNodes
-from ubl_graph.factors.tips import PosesAt, PoseSlopes, Tips
+from ubl_graph.factors.tips import PosesAt, Tips, TipTerms
 from ubl_graph.layout import Interpolation, Layout
 from ubl_graph.pose_path import Poses
 
@@ -75,19 +74,6 @@ class NodePoses(PosesAt):
         self._weights = np.zeros((len(nodes), 3))
 
 
-@dataclass(frozen=True, eq=False)
-class ArmedSlopes(PoseSlopes):
-    """`PoseSlopes` of poses that carry a point each.
-
-    Attributes
-    ----------
-    crosses : array, shape (m, 3, 3), or None
-        Cross-product matrices of the arms; None where there are no arms.
-    """
-
-    crosses: FloatArray | None = None
-
-
 class NodeTips(Tips):
     """Points fixed to vehicles at nodes, each with an arm of its own.
 
@@ -100,31 +86,22 @@ class NodeTips(Tips):
     """
 
     def __init__(self, poses: NodePoses, arms: FloatArray) -> None:
-        self._poses, self._arms = poses, arms
+        self._poses, self._arms, self._off = poses, arms, None
         self._crosses = lie.cross_matrix(arms)
         self._has_arm = bool(arms.any())
         self.columns = poses.columns
         self._still = np.zeros((len(arms), 3))
 
-    def at(self, x: FloatArray, rows: slice) -> tuple[FloatArray, tuple[FloatArray, PoseSlopes]]:
+    def at(self, x: FloatArray, rows: slice) -> tuple[FloatArray, TipTerms]:
         """Points (m, 3), m, and what gives their derivatives."""
         position, rotation, slopes = self._poses.at(x, rows)
         if self._has_arm:
             position = position + np.einsum("mij,mj->mi", rotation, self._arms[rows])
-        crosses = self._crosses[rows] if self._has_arm else None
-        return position, (rotation, ArmedSlopes(slopes.of, slopes.ends, slopes.by_end, crosses))
+        return position, TipTerms(rotation, slopes, self._crosses[rows])
 
-    def slopes(self, left: FloatArray, terms: tuple[FloatArray, PoseSlopes]) -> FloatArray:
-        """Derivatives (m, R, C) of what changes by `left` (m, R, 3) as the points move."""
-        rotation, slopes = terms
-        moved = left @ rotation
-        crosses = slopes.crosses if isinstance(slopes, ArmedSlopes) else None
-        turned = np.zeros_like(moved) if crosses is None else -moved @ crosses
-        return slopes.to_columns(np.concatenate([moved, turned], axis=2))
-
-    def variance(self, terms: tuple[FloatArray, PoseSlopes]) -> FloatArray:
+    def variance(self, terms: TipTerms) -> FloatArray:
         """Nothing moves between a node and itself: zeros (M, 3, 3)."""
-        return np.zeros((len(terms[0]), 3, 3))
+        return np.zeros((len(terms.rotation), 3, 3))
 
     @property
     def level_variance(self) -> FloatArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,25 @@ from ubl_graph.online.state import Moment
 
 #: What can go wrong in a solve.
 _FAILURES = (Exception,)
+
+
+@dataclass(eq=False)
+class Rival:
+    """Another track that fits.
+
+    Attributes
+    ----------
+    tracker : Reviser
+        Its buffer and window.
+    weight : float
+        Posterior probability among the tracks carried.
+    agrees : bool
+        Whether it took the last ping or fix.
+    """
+
+    tracker: Reviser
+    weight: float = 0.0
+    agrees: bool = True
 
 
 class Keeper:
@@ -45,6 +65,8 @@ class Keeper:
         What became of earlier records since the list was emptied last.
     latency : Latency
         How long updates take.
+    rivals : list of Rival
+        Other tracks that fit, heaviest first.
     """
 
     def __init__(self, setup: Setup) -> None:
@@ -56,6 +78,7 @@ class Keeper:
         self.events: list[Event] = []
         self.latency = Latency()
         self.resets = 0
+        self.rivals: list[Rival] = []
         self.start: Start | None = setup.start
 
     def refresh(self) -> None:
@@ -131,20 +154,26 @@ class Keeper:
 
     def widened(self, moment: Moment) -> FloatArray:
         """Covariance, another place that fits as well included."""
-        wide = self.ambiguity(moment.mean[None, :3])
+        wide = self.ambiguity(moment.mean[None, :3], np.array([moment.t]))
         if wide is None:
             return moment.covariance
         covariance = moment.covariance.copy()
         covariance[:3, :3] += wide[0]
         return covariance
 
-    def ambiguity(self, positions: FloatArray) -> FloatArray | None:
+    def ambiguity(
+        self,
+        positions: FloatArray,
+        times: FloatArray,  # noqa: ARG002 - who carries other tracks asks them
+    ) -> FloatArray | None:
         """What another place that fits as well adds to the covariances at (M, 3): (M, 3, 3)."""
-        if not self.state.ambiguous:
+        state = self.state
+        if not state.ambiguous:
             return None
-        gap = self.state.rival
+        gap = state.rival
         if gap is not None:
-            return np.broadcast_to(0.5 * np.outer(gap, gap), (len(positions), 3, 3))
+            wide = state.rival_weight * np.outer(gap, gap)
+            return np.broadcast_to(wide, (len(positions), 3, 3))
         middle = np.mean([b.position[:2] for b in self.setup.beacons] or [np.zeros(2)], axis=0)
         # Turned about the beacon by any angle.
         away = ((positions[:, :2] - middle) ** 2).sum(axis=1)

@@ -20,6 +20,7 @@ from ubl_graph.online.frame import Break, Frame, frame_of
 from ubl_graph.online.window import RowsOf, Window
 from ubl_graph.pose_states import COMPASS_SIGMA
 from ubl_graph.solve.banded import BandedFactor
+from ubl_graph.solve.evidence import FARTHEST, OUTLIERS
 
 #: Kinds of records that bring unknowns along where nodes are poses.
 POSE_KINDS = ("attitude", "heading", "angular_rate", "odometry")
@@ -62,6 +63,12 @@ class Ledger:
         Of the newest node, when a ping was judged last, m.
     turned : list of Entry
         Records whose fate the last solves turned; who tells of them empties it.
+    is_fresh : bool
+        Whether no ping has left the window: nothing is linearised for good.
+    past : float
+        Logarithm of what has left the window leaves of the posterior's mass, while `is_weighed`.
+    is_weighed : bool
+        Whether that is kept.
     """
 
     def __init__(self, setup: Setup) -> None:
@@ -84,6 +91,7 @@ class Ledger:
         self._judging: Context | None = None
         self.horizontal_sigma = 0.0
         self.turned: list[Entry] = []
+        self.is_fresh, self.is_weighed, self.past = True, False, 0.0
 
     def restore_window(
         self,
@@ -116,6 +124,12 @@ class Ledger:
         frame = frame_of(self.setup, self.kinds, lasting, gap, self.spacing)
         self.window = Window.of(frame, self.buffer, first, x, common, prior)
         self.window.breaks, self.window.is_pristine = breaks, pristine
+        self._velocities = len(self.buffer.of("velocity"))
+        self._paced = self._velocities
+
+    def take_window(self, window: Window) -> None:
+        """Begin with a copy of another ledger's window, whose records are in the buffer."""
+        self.window = window.copied(self.buffer)
         self._velocities = len(self.buffer.of("velocity"))
         self._paced = self._velocities
 
@@ -214,7 +228,7 @@ class Ledger:
         assert window is not None
         while window.count > 1:
             self._drop_first()
-        window.leap(slot_of(t, self.spacing))
+        self.past += window.leap(slot_of(t, self.spacing))
         self._forget()
 
     def extend(self, t: float) -> None:
@@ -307,7 +321,37 @@ class Ledger:
         if window.is_first_dirty:
             self._engine.note(window.refresh())
         self.version += 1
-        window.drop(self._rows_leaving(window.begin + self.spacing - 1e-9))
+        before = window.begin + self.spacing - 1e-9
+        if self.is_weighed:
+            self.past -= self._price_of_leaving(before)
+        leaving = self._rows_leaving(before)
+        self.is_fresh &= not leaving
+        self.past += window.drop(leaving)
+
+    def _price_of_leaving(self, before: float) -> float:
+        """What pings that leave cost a posterior's mass, beside the rows that remain of them."""
+        window = self.window
+        assert window is not None
+        total = 0.0
+        for entry, r, sigma in self.whitened():
+            if window.begin - 1e-9 <= entry.begin < before:
+                total += price(r, sigma)
+                if not entry.gated:
+                    total -= 0.5 * float(window.loss.weights(np.array([r]))[0]) * r * r
+        return total
+
+    def whitened(self) -> list[tuple[Entry, float, float]]:
+        """Residuals, in sigmas, of all the window's pings, gated ones too, and those sigmas, s."""
+        window = self.window
+        assert window is not None
+        out: list[tuple[Entry, float, float]] = []
+        usable, x = window.usable(gated=True), window.vector
+        for block in window.ranges(usable):
+            kind = [e for e in usable if e.kind == block.name]
+            held = block.frozen(x)
+            r = block.evaluate(x, held, jacobian=False)[0][:, 0]
+            out += [(e, float(a), float(s)) for e, a, s in zip(kind, r, held, strict=True)]
+        return out
 
     def _rows_leaving(self, before: float) -> list[RowsOf]:
         """Linearised rows of the window's pings that begin before a time, s."""
@@ -354,6 +398,22 @@ class Ledger:
         if self.window is not None:
             self.window.shift(slots)
         self._forget()
+
+
+def price(residual: float, sigma: float) -> float:
+    """What a ping costs the logarithm of a posterior's mass: normal noise, or an outlier's share.
+
+    As `ubl_graph.solve.evidence` tells them, with a fixed share of outliers.
+
+    Parameters
+    ----------
+    residual : float
+        In standard deviations.
+    sigma : float
+        Standard deviation, s.
+    """
+    usual = 0.5 * residual**2 + math.log(math.sqrt(2.0 * math.pi) * sigma / (1.0 - OUTLIERS))
+    return min(usual, math.log(2.0 * FARTHEST / OUTLIERS))
 
 
 def _straightness(entry: Entry) -> float:

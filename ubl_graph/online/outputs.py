@@ -61,6 +61,26 @@ class Outcome:
 
 
 @dataclass(frozen=True, eq=False)
+class Place:
+    """One of several places where the vehicle may be.
+
+    Attributes
+    ----------
+    position, velocity : array, shape (3,)
+        East, north, up; m and m/s.
+    covariance : array, shape (6, 6)
+        Position first, then velocity; m and m/s. It holds if the vehicle is there.
+    weight : float
+        Posterior probability among them; they add up to 1.
+    """
+
+    position: FloatArray
+    velocity: FloatArray
+    covariance: FloatArray
+    weight: float
+
+
+@dataclass(frozen=True, eq=False)
 class Estimate:
     """Where the vehicle is.
 
@@ -81,6 +101,8 @@ class Estimate:
     pose_covariance : array, shape (6, 6), or None
         Translation first, world axes: east, north, up (m), then the rotation about east, north and
         up (rad).
+    hypotheses : tuple of Place
+        While the status is ambiguous: this place first, then the others that fit, heaviest first.
     """
 
     t: float
@@ -91,6 +113,7 @@ class Estimate:
     reasons: tuple[str, ...] = ()
     rotation: FloatArray | None = None
     pose_covariance: FloatArray | None = None
+    hypotheses: tuple[Place, ...] = ()
 
     @property
     def attitude(self) -> FloatArray | None:
@@ -116,6 +139,7 @@ class Memory:
     lost_at: float = 0.0
     ambiguous: str = ""
     rival: FloatArray | None = None
+    rival_weight: float = 0.5
     rebuilt: bool = False
     notes: dict[str, float] = field(default_factory=dict[str, float])
     clock_steps: int = 0

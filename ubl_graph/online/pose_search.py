@@ -32,13 +32,6 @@ def put_track(window: Window, nodes: FloatArray, track: PoseTrajectory) -> Float
     return times - inside
 
 
-def turned_with(track: PoseTrajectory, velocity: FloatArray) -> FloatArray:
-    """Rotations (N, 3, 3) of a track whose velocities (N, 3) turn to others, about the vertical."""
-    courses = [np.arctan2(v[:, 1], v[:, 0]) for v in (velocity, track.velocity)]
-    turn = (courses[0] - courses[1])[:, None] * np.array([0.0, 0.0, 1.0])
-    return lie.rotation(turn) @ track.rotation
-
-
 def is_headed(buffer: Buffer) -> bool:
     """Whether anything in the buffer tells the heading, or nothing there asks for it."""
     if any(buffer.of(kind) for kind in HEADED) or _set_headings(buffer):

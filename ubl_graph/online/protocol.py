@@ -22,6 +22,7 @@ from ubl_graph.records import Records
 if TYPE_CHECKING:
     from ubl_graph.mission import Setup
     from ubl_graph.online.estimator import Estimate
+    from ubl_graph.online.outputs import Place
 
 #: A line longer than this is no record, bytes.
 MAX_LINE = 1_000_000
@@ -233,9 +234,18 @@ def estimate_content(estimate: Estimate, asked: float | None = None) -> dict[str
         content["pose_covariance"] = estimate.pose_covariance.ravel().tolist()
     covariance = estimate.covariance
     content["covariance"] = None if covariance is None else covariance.ravel().tolist()
+    if estimate.hypotheses:
+        content["hypotheses"] = [_place_content(place) for place in estimate.hypotheses]
     content["status"] = estimate.status
     content["reasons"] = list(estimate.reasons)
     return content
+
+
+def _place_content(place: Place) -> dict[str, Any]:
+    content: dict[str, Any] = {"weight": place.weight}
+    content.update(zip(("east", "north", "up"), place.position.tolist(), strict=True))
+    content.update(zip(("v_east", "v_north", "v_up"), place.velocity.tolist(), strict=True))
+    return content | {"covariance": place.covariance.ravel().tolist()}
 
 
 def verdict_content(kind: str, why: str, record: Any, *, final: bool = True) -> dict[str, Any]:

@@ -37,7 +37,9 @@ class Reviser(Tracker):
         """Look for the position in all that the buffer holds."""
         window = self.window
         assert window is not None
-        begin = max(window.begin, window.end - self.spacing - self.lag - MARGIN)
+        begin = window.begin
+        if not self.is_fresh:
+            begin = max(begin, window.end - self.spacing - self.lag - MARGIN)
         return search(self.setup, self.buffer, self.spacing, begin, start)
 
     def begin_at_fixes(self) -> bool:
@@ -70,7 +72,7 @@ class Reviser(Tracker):
         """Whether the window's cost speaks against the other track that a search found."""
         window = self._refreshed()
         present, here = self.cost_from(window.vector)
-        cost, there = self.cost_from(placed(window, found.other))
+        cost, there = self.cost_from(placed(window, found.track(1)))
         end = slice((window.count - 1) * window.frame.width, None)
         gap = float(np.hypot(*(there[end] - here[end])[:2]))
         return cost > present + BETTER_COST or gap < SAME_PLACE

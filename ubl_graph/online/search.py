@@ -8,13 +8,14 @@ import numpy as np
 
 from ubl_graph.arrays import FloatArray
 from ubl_graph.errors import UblGraphError
+from ubl_graph.hypotheses import ANOTHER
 from ubl_graph.layout import KINEMATIC
 from ubl_graph.measurements import PositionFix
 from ubl_graph.mission import Mission, Segment, Setup, Start
 from ubl_graph.nodes import grid, slot_of
 from ubl_graph.online.buffer import PINGS, Buffer, Entry, columns_of, fixes_of, odometry_of
 from ubl_graph.online.grid_odometry import on_grid
-from ubl_graph.online.pose_search import put_track, turned_with
+from ubl_graph.online.pose_search import put_track
 from ubl_graph.online.pose_state import poses_of, put_poses
 from ubl_graph.online.window import Window
 from ubl_graph.pose_trajectory import PoseTrajectory
@@ -49,30 +50,32 @@ class Found:
         return self.result is not None and (self.ambiguous or not self.reason)
 
     @property
-    def other(self) -> Found:
-        """The same with the other track in place of the best one."""
+    def is_open(self) -> bool:
+        """Whether the tracks that fit are no several places: it can be turned about a beacon."""
+        return self.ambiguous and not self.reason.startswith(ANOTHER)
+
+    def track(self, number: int) -> Found:
+        """The same with another one of the hypotheses in place of the best."""
         assert self.result is not None
         segment = self.result.segments[0]
-        track = segment.trajectory
-        assert segment.rival is not None
-        velocity = track.velocity
-        if len(track.t) > 1:
-            velocity = np.gradient(segment.rival, track.t, axis=0)
-        mirrored = replace(track, position=segment.rival, velocity=velocity)
-        if isinstance(track, PoseTrajectory) and isinstance(mirrored, PoseTrajectory):
-            mirrored = replace(mirrored, rotation=turned_with(track, velocity))
-        segments = (replace(segment, trajectory=mirrored), *self.result.segments[1:])
+        other = segment.hypotheses[number].trajectory
+        segments = (replace(segment, trajectory=other), *self.result.segments[1:])
         return replace(self, result=replace(self.result, segments=segments))
 
     @property
     def rival(self) -> FloatArray | None:
         """How far away the other track ends, east, north, up, m; None where it is not one place."""
-        if self.result is None:
+        if self.result is None or len(self.result.segments[0].hypotheses) < 2:
             return None
-        segment = self.result.segments[0]
-        if segment.rival is None:
-            return None
-        return segment.rival[-1] - segment.trajectory.position[-1]
+        answer, other = self.result.segments[0].hypotheses[:2]
+        return other.trajectory.position[-1] - answer.trajectory.position[-1]
+
+    @property
+    def rival_weight(self) -> float:
+        """Weight of the other track among those that were found; 0 where there is none."""
+        if self.result is None or len(self.result.segments[0].hypotheses) < 2:
+            return 0.0
+        return self.result.segments[0].hypotheses[1].weight
 
 
 def search(

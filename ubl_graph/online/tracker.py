@@ -19,7 +19,7 @@ from ubl_graph.online.buffer import PINGS, Entry, columns_of
 from ubl_graph.online.engines import Context
 from ubl_graph.online.equations import Point
 from ubl_graph.online.gate import distance, limit
-from ubl_graph.online.ledger import Ledger, Solved
+from ubl_graph.online.ledger import Ledger, Solved, price
 from ubl_graph.online.lm import minimise
 from ubl_graph.online.pose_gap import place_of, pose_gap
 from ubl_graph.online.rows import LEVEL, attitude_over
@@ -312,6 +312,22 @@ class Tracker(Ledger):
         if isinstance(states, PoseStates):
             return Moment(t, mean, covariance, states.rotation[0], states.pose_covariance[0])
         return Moment(t, mean, covariance)
+
+    def log_mass(self) -> float:
+        """Logarithm of the posterior's mass about the window's track, but for a constant.
+
+        Laplace's approximation over the window, and what has left it since `is_weighed`. Pings
+        have normal noise there or are outliers, as for `ubl_graph.solve.evidence`.
+        """
+        if self.is_stale:
+            self.solve()
+        factor = self.factor()
+        assert self._solved is not None
+        point = self._solved.point
+        squares = float(np.sum(point.linear**2) + np.sum(point.prior**2))
+        pings = sum(price(r, sigma) for _, r, sigma in self.whitened())
+        pivots = np.concatenate([factor.band[0], factor.corner.diagonal()])
+        return self.past - 0.5 * squares - pings - float(np.log(pivots).sum())
 
     def trajectory(self) -> Trajectory:
         """The whole window with covariances."""

@@ -9,6 +9,7 @@ difference of normal equations does not); what remains is the prior of the nodes
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from copy import copy, deepcopy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -121,6 +122,15 @@ class Window:
         window._prior, window._prior_target = prior
         window.touch_all()
         return window
+
+    def copied(self, buffer: Buffer) -> Window:
+        """The same window, rows and all, over another buffer of the same records."""
+        twin = copy(self)
+        twin._buffer = buffer
+        twin.x, twin.common, twin.up = self.x.copy(), self.common.copy(), self.up.copy()
+        twin.made_at, twin.linear = self.made_at.copy(), deepcopy(self.linear)
+        twin.breaks, twin._dirty = dict(self.breaks), set(self._dirty)
+        return twin
 
     def restore_poses(self, up: FloatArray, made_at: FloatArray, dirty: Iterable[int]) -> None:
         """Put planar nodes where they were held, and rows of poses where they were made.
@@ -313,13 +323,18 @@ class Window:
         fresh = (self.times >= t[0]) | self.is_pristine
         self.up[fresh] = np.interp(self.times[fresh], t, up)
 
-    def drop(self, pings: Sequence[RowsOf]) -> None:
+    def drop(self, pings: Sequence[RowsOf]) -> float:
         """Eliminate the first node.
 
         Parameters
         ----------
         pings : sequence of RowsOf
             The rows of pings that touch its interval.
+
+        Returns
+        -------
+        float
+            Logarithm of what integrating it out leaves of the posterior's mass, but for a constant.
         """
         self.is_pristine = False
         frame = self.frame
@@ -336,16 +351,24 @@ class Window:
             whole[:, -1] = target
             stacked.append(whole)
         # What stands below the node's own rows does not speak of it.
-        rest = triangle(np.concatenate(stacked))[w:size, w:]
+        whole = triangle(np.concatenate(stacked))
+        rest = whole[w:size, w:]
         self._prior, self._prior_target = rest[:, :-1], rest[:, -1]
         self.first, self.count = self.first + 1, self.count - 1
         self.x, self.up, self.made_at = self.x[1:], self.up[1:], self.made_at[1:]
         self.linear.drop()
         self._dirty.discard(self.first - 1)
         self.breaks.pop(self.first - 1, None)
+        return _left_mass(whole, w, size)
 
-    def leap(self, slot: int) -> None:
-        """Carry the prior of a single node that is left to one far ahead, nothing in between."""
+    def leap(self, slot: int) -> float:
+        """Carry the prior of a single node that is left to one far ahead, nothing in between.
+
+        Returns
+        -------
+        float
+            As `drop` does.
+        """
         frame, ahead = self.frame, (slot - self.first) * self.frame.spacing
         start = self.predicted(self.x[0], np.array([ahead]))[0]
         layout = frame.layout(np.array([0.0, ahead]))
@@ -359,7 +382,8 @@ class Window:
         prior[:, :w], prior[:, 2 * w : size] = self._prior[:, :w], self._prior[:, w:]
         prior[:, -1] = self._prior_target
         rows = [_dense(block, size) for block in blocks]
-        rest = triangle(np.concatenate([prior, *rows]))[w:size, w:]
+        whole = triangle(np.concatenate([prior, *rows]))
+        rest = whole[w:size, w:]
         self._prior, self._prior_target = rest[:, :-1], rest[:, -1]
         self.first, self.count = slot, 2
         self.up, self.made_at = np.repeat(self.up[:1], 2), np.zeros((1, frame.interval))
@@ -367,6 +391,7 @@ class Window:
         self.linear = LinearRows(frame.width, frame.border, frame.height)
         self.breaks.clear()
         self._dirty = {slot}
+        return _left_mass(whole, w, size)
 
     def shift(self, slots: int) -> None:
         """Move all nodes by so many places: the clock was set."""
@@ -427,8 +452,11 @@ class Window:
                 out.append(builder.range_block(layout.chains[0], records, attitude))
         return out
 
-    def usable(self) -> list[Entry]:
-        """Pings that count: inside the window, not gated, with an attitude where that is needed."""
+    def usable(self, *, gated: bool = False) -> list[Entry]:
+        """Pings that count: inside the window, with an attitude where that is needed.
+
+        `gated`: those too that a gate refused.
+        """
         bare = self.frame.is_posed or self.frame.setup.vehicle.transducer.is_zero
         if not bare and not self._buffer.of("attitude"):
             return []
@@ -437,7 +465,7 @@ class Window:
             e
             for kind in PINGS
             for e in self._buffer.of(kind)
-            if not e.gated and e.begin >= begin and e.t <= end
+            if (gated or not e.gated) and e.begin >= begin and e.t <= end
         ]
 
     def equations(self, ranges: Sequence[RangeBlock]) -> WindowEquations:
@@ -530,6 +558,16 @@ class Window:
             if v.name in names:
                 taken.update(range(v.column, v.column + v.size))
         return taken
+
+
+def _left_mass(whole: FloatArray, width: int, size: int) -> float:
+    """Logarithm of the integral over the first `width` of `size` columns, by the triangle of rows.
+
+    The last column holds right-hand sides; what stands below all others is the least residual.
+    """
+    residual = float(np.sum(whole[size:, size] ** 2))
+    pivots = np.abs(np.diagonal(whole)[:width])
+    return -0.5 * residual - float(np.log(np.maximum(pivots, np.finfo(float).tiny)).sum())
 
 
 def _dense(block: Block, size: int) -> FloatArray:

@@ -7,10 +7,14 @@ factorises the band, Schur's complement takes in what all nodes share.
 
 from __future__ import annotations
 
+from copy import copy
+from dataclasses import replace
+
 import numpy as np
 from scipy.linalg import get_lapack_funcs
 
 from ubl_graph.arrays import FloatArray
+from ubl_graph.factors.loss import RobustLoss
 from ubl_graph.problem import Frozen, LeastSquares
 from ubl_graph.solve.normal import NormalEquations, dot
 from ubl_graph.solve.rounds import (
@@ -103,6 +107,13 @@ class BandedEngine:
     def __init__(self, problem: LeastSquares) -> None:
         self.problem = problem
         self._equations = NormalEquations(problem)
+
+    def with_loss(self, loss: RobustLoss) -> BandedEngine:
+        """An engine for the same problem under another loss, over the same memory."""
+        other = copy(self)
+        other.problem = replace(self.problem, loss=loss)
+        other._equations = self._equations.of(other.problem)
+        return other
 
     def begin(self, x: FloatArray, frozen: Frozen) -> BandedDescent:
         """Start a run at the flat vector `x`."""

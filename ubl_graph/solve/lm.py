@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 from scipy import sparse
 
 from ubl_graph.arrays import FloatArray
 from ubl_graph.errors import SolverError
+from ubl_graph.factors.loss import RobustLoss
 from ubl_graph.gtsam_view import GraphView
 from ubl_graph.problem import Frozen, LeastSquares
 from ubl_graph.solve.rounds import (
@@ -32,6 +35,10 @@ class GtsamEngine:
     def __init__(self, problem: LeastSquares) -> None:
         self.problem = problem
         self._view = GraphView(problem)
+
+    def with_loss(self, loss: RobustLoss) -> GtsamEngine:
+        """An engine for the same problem under another loss."""
+        return GtsamEngine(replace(self.problem, loss=loss))
 
     def begin(self, x: FloatArray, frozen: Frozen) -> GtsamDescent:
         """Start a run at the flat vector `x`.

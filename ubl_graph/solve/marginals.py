@@ -146,6 +146,35 @@ class Marginals(Covariances):
         super().__init__(layout, found.node, found.following, found.shared, found.scale, unresolved)
 
 
+def shared_covariance(problem: Problem, x: FloatArray) -> FloatArray:
+    """Covariance of what all nodes share, SI, as it would be at `x`: nothing is solved for.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of which unknowns.
+    x : array
+        Flat vector; a start, most often.
+
+    Returns
+    -------
+    array, shape (S, S)
+        In the order of `layout.shared`.
+
+    Raises
+    ------
+    SolverError
+        As `Marginals` does.
+    """
+    layout = problem.layout
+    equations = NormalEquations(problem)
+    point = equations.evaluate(x, problem.frozen(x))
+    factor, scale, _ = scaled_factor(equations, point, RIDGES)
+    units = [np.full(size, layout.unit(name)) for name, size in layout.shared]
+    outer = scale[layout.inner :] * np.concatenate([np.empty(0), *units])
+    return outer[:, None] * factor.inverse_corner() * outer
+
+
 @dataclass(frozen=True, eq=False)
 class _Inverse:
     """Blocks of the scaled inverse, and how far to trust them."""

@@ -14,6 +14,7 @@ one flat store, band first, so that a place is one number.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -137,6 +138,13 @@ class NormalEquations:
         self._products = [_Products(b.columns, *_all_entries(b), self.shape) for b in curved]
         # Pads point at an extra entry that nobody reads.
         self._columns = [np.where(b.columns < 0, len(zero), b.columns).ravel() for b in curved]
+
+    def of(self, problem: LeastSquares) -> NormalEquations:
+        """Those of a problem that differs in its loss alone: structure and memory are shared."""
+        _ = self._matrix, self._transposed, self._target, self._store
+        other = copy(self)
+        other.problem = problem
+        return other
 
     def evaluate(self, x: FloatArray, frozen: Frozen) -> Point:
         """Evaluate all rows at `x`."""

@@ -14,6 +14,7 @@ import numpy as np
 
 from ubl_graph.arrays import FloatArray
 from ubl_graph.errors import SolverError
+from ubl_graph.factors.loss import RobustLoss
 from ubl_graph.problem import Frozen, LeastSquares
 
 INITIAL_LAMBDA, LAMBDA_FACTOR, LARGEST_LAMBDA = 1e-3, 10.0, 1e10
@@ -35,10 +36,8 @@ FREEZE_TOLERANCE = 1e-4
 #: space to the same place.
 POLISH = 2
 
-#: Widths by which `graduated` multiplies the robust rows' standard deviations, one after another,
+#: Multiples of a loss's width, one after another, that lead from a start which is not far off.
 GRADUATION = (30.0, 10.0, 3.0)
-#: and iterations for each: the next width begins somewhere near in any case.
-GRADUATION_ITERATIONS = 10
 
 #: Called with the iteration's number and cost.
 Progress = Callable[[int, float], None]
@@ -85,6 +84,10 @@ class Engine(Protocol):
 
     def begin(self, x: FloatArray, frozen: Frozen) -> Descent:
         """Start a run at `x`."""
+        ...
+
+    def with_loss(self, loss: RobustLoss) -> Engine:
+        """An engine for the same problem under another loss."""
         ...
 
 
@@ -182,37 +185,6 @@ def confirms(engine: Engine, solution: Solution) -> bool:
     descent.iterate()
     same = at_rest(max(cost, solution.cost), min(cost, solution.cost))
     return same and at_rest(cost, descent.cost) and not _exhausted(descent)
-
-
-def graduated(engine: Engine, x: FloatArray) -> FloatArray:
-    """Approach a robust problem from its convex side: a start for `solve`.
-
-    The standard deviations of the robust rows begin 30 times too wide, where no ping is an
-    outlier, and shrink in steps; each step starts where the last one ended. It finds the good
-    minimum where a direct solve, begun near a wrong one, lets the true pings be the outliers.
-
-    Parameters
-    ----------
-    engine : Engine
-        What minimises, and what.
-    x : array
-        Start, flat vector.
-
-    Returns
-    -------
-    array
-        Flat vector after the last step but one; `solve` does the last.
-
-    Raises
-    ------
-    SolverError
-        As `solve` does.
-    """
-    for width in GRADUATION:
-        held = engine.problem.frozen(x)
-        wide = tuple(None if sigma is None else width * sigma for sigma in held)
-        x, *_ = _round(engine, x, wide, GRADUATION_ITERATIONS, 0, None)
-    return x
 
 
 def _round(
