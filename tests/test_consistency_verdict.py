@@ -13,6 +13,9 @@ from scipy.stats import chi2
 from ubl_graph import (
     Beacon,
     ConfigurationError,
+    FixedLagEstimator,
+    Fleet,
+    Member,
     Mission,
     Options,
     Segment,
@@ -232,8 +235,9 @@ def test_everything_is_scaled_by_one_factor(right):
     for name in ("covariance", "velocity_covariance"):
         plain, scaled = (getattr(r.trajectory.at(times), name) for r in (right, mended))
         np.testing.assert_allclose(scaled, square * plain, rtol=1e-9, atol=1e-15)
-    plain, scaled = (r.segments[0].slow["sound_speed"].sigma for r in (right, mended))
-    np.testing.assert_allclose(scaled, found.factor * plain)
+    plain, scaled = (r.segments[0].slow["sound_speed"] for r in (right, mended))
+    np.testing.assert_allclose(scaled.sigma, found.factor * plain.sigma)
+    assert scaled.observed == plain.observed
     assert calibrated(mended).trajectory.covariance[5, 0, 0] == pytest.approx(
         mended.trajectory.covariance[5, 0, 0]
     )
@@ -251,6 +255,10 @@ def test_poses_are_scaled_too():
     np.testing.assert_allclose(
         mended.shared["odometry_scale"].sigma, found.factor * plain.shared["odometry_scale"].sigma
     )
+    # What the data tell is not less for a covariance that is scaled afterwards.
+    loud = replace(plain, consistency=replace(found, factor=50.0))
+    for name, state in calibrated(loud).shared.items():
+        assert state.observed == plain.shared[name].observed
 
 
 def test_the_option_does_it_and_the_files_say_so(right):
@@ -272,6 +280,15 @@ def test_other_words_are_refused(name: str):
         Options(**{name: "perfect"})
 
 
+@pytest.mark.parametrize("change", [{"covariance": "calibrated"}, {"noise": "inflated"}])
+def test_only_whole_missions_of_one_vehicle_have_held_out_pings(change):
+    options = Options(**change)
+    with pytest.raises(ConfigurationError, match="whole missions of one vehicle"):
+        FixedLagEstimator(options, beacons=BEACONS)
+    with pytest.raises(ConfigurationError, match="whole missions of one vehicle"):
+        Fleet((Member("auv", Segment()),), beacons=BEACONS, options=options)
+
+
 def test_noise_is_inflated_on_request():
     mission = solved("ranges", 1).mission
     result = smooth(replace(mission, options=replace(mission.options, noise="inflated")))
@@ -280,6 +297,7 @@ def test_noise_is_inflated_on_request():
     before, after = (m.segments[0].two_way_range.sigma for m in (mission, result.mission))
     np.testing.assert_allclose(after, found.noise["ranges"] * before)
     assert result.mission.options.noise == "given"
+    assert {"held-out", "solve"} <= set(result.wall_times)
     assert nees(result) < 0.6 * nees(solved("ranges", 1))
 
 

@@ -172,11 +172,14 @@ def calibrated(result: Result) -> Result:
 
 
 def _scaled_shared(shared: Shared, factor: float) -> Shared:
-    return replace(shared, covariance=factor**2 * shared.covariance)
+    return replace(shared, covariance=factor**2 * shared.covariance, scale=factor * shared.scale)
 
 
 def _scaled_segment(segment: SegmentResult, factor: float) -> SegmentResult:
-    slow = {name: replace(s, sigma=factor * s.sigma) for name, s in segment.slow.items()}
+    slow = {
+        name: replace(s, sigma=factor * s.sigma, scale=factor * s.scale)
+        for name, s in segment.slow.items()
+    }
     others = tuple(
         replace(h, trajectory=_scaled_track(h.trajectory, factor)) for h in segment.hypotheses
     )

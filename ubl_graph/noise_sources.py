@@ -159,8 +159,8 @@ class NoiseSources:
 
         Parameters
         ----------
-        along : array, shape (P, size)
-            A, by the columns of the flat vector.
+        along : array, shape (P, U)
+            A, by the U columns of the flat vector.
         own : array, shape (P, B)
             What a lasting error of each beacon adds besides, for a unit of it.
 

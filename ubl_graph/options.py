@@ -314,15 +314,22 @@ class Options:
         return float(getattr(self, name))
 
     def require_settled(self) -> None:
-        """Refuse options that are left to the data.
+        """Refuse options that only a whole mission of one vehicle can have.
 
         Raises
         ------
         ConfigurationError
-            Where there are any.
+            Where something is left to the data, or held-out pings are asked for.
         """
         for name in self.automatic:
             self._refuse_automatic(name)
+        for name, usual in (("covariance", "formal"), ("noise", "given")):
+            if getattr(self, name) != usual:
+                raise ConfigurationError(
+                    f"'{getattr(self, name)}' is for whole missions of one vehicle",
+                    f"leave it out, or give '{usual}'",
+                    field=f"options.{name}",
+                )
 
     def _refuse_automatic(self, name: str) -> None:
         if getattr(self, name) == AUTO:

@@ -38,18 +38,21 @@ class SlowState:
         the travel times: the true speed is the given one times exp(-value).
     prior : array, shape (size,), optional
         Standard deviations at the first node before any measurement.
+    scale : float
+        By which `sigma` was multiplied when the covariances were calibrated; priors never are.
     """
 
     t: FloatArray
     value: FloatArray
     sigma: FloatArray
     prior: FloatArray | None = None
+    scale: float = 1.0
 
     @property
     def observed(self) -> bool:
         """Whether the data tell at least as much of every component as was known before."""
         return self.prior is None or bool(
-            (np.median(self.sigma, axis=0) <= OBSERVED * self.prior).all()
+            (np.median(self.sigma, axis=0) <= self.scale * OBSERVED * self.prior).all()
         )
 
 
@@ -67,12 +70,16 @@ class Shared:
         Standard deviations before any measurement.
     expected : array, shape (size, size), optional
         The covariance that the geometry of the start promised, before anything was solved.
+    scale : float
+        By whose square `covariance` was multiplied when the covariances were calibrated; `prior`
+        and `expected` never are.
     """
 
     value: FloatArray
     covariance: FloatArray
     prior: FloatArray | None = None
     expected: FloatArray | None = None
+    scale: float = 1.0
 
     @property
     def sigma(self) -> FloatArray:
@@ -82,7 +89,7 @@ class Shared:
     @property
     def observed(self) -> bool:
         """Whether the data tell at least as much in every direction as was known before."""
-        return self._is_observed(self.covariance)
+        return self._is_observed(self.covariance / self.scale**2)
 
     @property
     def observable(self) -> bool:

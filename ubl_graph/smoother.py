@@ -99,11 +99,19 @@ def _mended(work: _Work, result: Result) -> Result:
             found = assess(result)
             mission = inflated(result.mission, found)
         mission = replace(mission, options=replace(mission.options, noise="given"))
-        return replace(smooth(mission), tuning=result.tuning, inflation=found)
+        return _told_of_both(result, replace(smooth(mission, work.progress), inflation=found))
     if options.covariance == "calibrated":
         with work.stage("held-out"):
             return calibrated(result)
     return result
+
+
+def _told_of_both(first: Result, second: Result) -> Result:
+    """The second of two solves, with what should be known of the first."""
+    names = dict.fromkeys([*first.wall_times, *second.wall_times])
+    times = {n: first.wall_times.get(n, 0.0) + second.wall_times.get(n, 0.0) for n in names}
+    warnings = tuple(dict.fromkeys([*first.warnings, *second.warnings]))
+    return replace(second, tuning=first.tuning, warnings=warnings, wall_times=times)
 
 
 def _tune(work: _Work) -> Tuning | None:
