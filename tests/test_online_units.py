@@ -36,10 +36,11 @@ from ubl_graph.mission import Setup
 from ubl_graph.nodes import ROUND_SPACINGS, grid_spacing, grid_times, slot_of
 from ubl_graph.online.buffer import Buffer, columns_of, entry_of, odometry_of
 from ubl_graph.online.clock import AHEAD, BEHIND, Clock
+from ubl_graph.online.elimination import RowsOf
 from ubl_graph.online.equations import WindowEquations
 from ubl_graph.online.frame import frame_of
 from ubl_graph.online.gate import REOPENS, Gate, distance, limit, step_distance
-from ubl_graph.online.window import RowsOf, Window
+from ubl_graph.online.window import Window
 from ubl_graph.trajectory import (
     interpolation_covariance,
     interpolation_variance,

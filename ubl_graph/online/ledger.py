@@ -14,10 +14,11 @@ from ubl_graph.factors.ranges import RangeBlock
 from ubl_graph.mission import Setup
 from ubl_graph.nodes import grid, grid_spacing, slot_of
 from ubl_graph.online.buffer import HELD, PINGS, Buffer, Entry
+from ubl_graph.online.elimination import RowsOf
 from ubl_graph.online.engines import Context, engine_of
 from ubl_graph.online.equations import Point, WindowEquations
 from ubl_graph.online.frame import Break, Frame, frame_of
-from ubl_graph.online.window import RowsOf, Window
+from ubl_graph.online.window import Window
 from ubl_graph.pose_states import COMPASS_SIGMA
 from ubl_graph.solve.banded import BandedFactor
 from ubl_graph.solve.evidence import FARTHEST, OUTLIERS

@@ -10,52 +10,39 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from copy import copy, deepcopy
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
 from ubl_graph.arrays import FloatArray, IntArray
 from ubl_graph.attitude import AttitudeTrack
-from ubl_graph.factors.block import Block, LinearBlock
+from ubl_graph.factors.block import LinearBlock
 from ubl_graph.factors.loss import RobustLoss
 from ubl_graph.factors.ranges import RangeBlock
 from ubl_graph.layout import Layout
 from ubl_graph.nodes import grid, slot_of
 from ubl_graph.online.buffer import PINGS, Buffer, Entry, columns_of
+from ubl_graph.online.elimination import (
+    NearRows,
+    RowsOf,
+    columns_among,
+    columns_known,
+    embedded,
+    leapt,
+    near_rows,
+    without_first,
+)
 from ubl_graph.online.equations import LinearRows, WindowEquations
+from ubl_graph.online.forecast import predicted
 from ubl_graph.online.frame import Break, Frame
 from ubl_graph.online.pose_rows import linearised, tolerances
 from ubl_graph.online.pose_state import (
     heights_of,
     is_turned,
     leap_block,
-    moved_on,
-    poses_of,
-    put_poses,
 )
 from ubl_graph.online.rows import LEVEL, attitude_over, interval_rows, triangle
 from ubl_graph.pose_builder import PoseBuilder
-from ubl_graph.trajectory import transition
-
-
-@dataclass(frozen=True, eq=False)
-class RowsOf:
-    """Linearised rows of pings, weighted by the loss.
-
-    Attributes
-    ----------
-    columns : array of int, shape (M, C)
-        Of the window; -1 pads.
-    residual : array, shape (M,)
-        Where the window stands.
-    slope : array, shape (M, C)
-        Its derivatives.
-    """
-
-    columns: IntArray
-    residual: FloatArray
-    slope: FloatArray
 
 
 class Window:
@@ -246,30 +233,7 @@ class Window:
 
     def predicted(self, node: FloatArray, dt: FloatArray) -> FloatArray:
         """A node's unknowns (W,) carried ahead by times `dt` (M,), s: (M, W)."""
-        out = node @ np.swapaxes(self.carried(dt), 1, 2)
-        if self.frame.is_posed:
-            some = np.repeat(node[None], len(dt), axis=0)
-            poses = poses_of(self.frame, some, np.zeros(len(dt)))
-            put_poses(self.frame, out, moved_on(poses, dt), None)
-        return out
-
-    def carried(self, dt: FloatArray) -> FloatArray:
-        """Transition of a node's unknowns over times `dt` (M,), s: (M, W, W)."""
-        frame, n = self.frame, self.frame.order
-        out = np.broadcast_to(np.eye(frame.width), (len(dt), frame.width, frame.width)).copy()
-        phi = transition(n, dt)
-        for axis in range(0 if frame.is_posed else 3):
-            own = axis + 3 * np.arange(n)
-            out[:, own[:, None], own[None, :]] = phi
-        slow = dict(frame.slow)
-        if "clock_drift" in slow:
-            layout = frame.layout(np.zeros(1))
-            offset, drift = (
-                int(layout.node_columns(name, np.zeros(1, dtype=np.int64))[0, 0])
-                for name in ("clock_offset", "clock_drift")
-            )
-            out[:, offset, drift] = dt * layout.unit("clock_drift") / layout.unit("clock_offset")
-        return out
+        return predicted(self.frame, node, dt)
 
     def refresh(self, x: FloatArray | None = None) -> set[int]:
         """Make the rows of changed intervals anew; which they were.
@@ -338,28 +302,15 @@ class Window:
         """
         self.is_pristine = False
         frame = self.frame
-        w, b = frame.width, frame.border
-        parts = [self._prior_rows(), (self.linear.rows[0], self.linear.targets[0], 2)]
-        parts += [self._near_rows(rows) for rows in pings]
-        nodes = max(part[2] for part in parts)
-        size = nodes * w + b
-        stacked: list[FloatArray] = []
-        for rows, target, reach in parts:
-            whole = np.zeros((len(rows), size + 1))
-            whole[:, : reach * w] = rows[:, : reach * w]
-            whole[:, nodes * w : size] = rows[:, reach * w :]
-            whole[:, -1] = target
-            stacked.append(whole)
-        # What stands below the node's own rows does not speak of it.
-        whole = triangle(np.concatenate(stacked))
-        rest = whole[w:size, w:]
-        self._prior, self._prior_target = rest[:, :-1], rest[:, -1]
+        parts = [self._prior_rows(), NearRows(self.linear.rows[0], self.linear.targets[0], 2)]
+        parts += [near_rows(rows, self.x, self.common) for rows in pings]
+        self._prior, self._prior_target, log_mass = without_first(parts, frame.width, frame.border)
         self.first, self.count = self.first + 1, self.count - 1
         self.x, self.up, self.made_at = self.x[1:], self.up[1:], self.made_at[1:]
         self.linear.drop()
         self._dirty.discard(self.first - 1)
         self.breaks.pop(self.first - 1, None)
-        return _left_mass(whole, w, size)
+        return log_mass
 
     def leap(self, slot: int) -> float:
         """Carry the prior of a single node that is left to one far ahead, nothing in between.
@@ -377,21 +328,16 @@ class Window:
             ends, up = np.stack([self.x[0], start]), np.repeat(self.up[:1], 2)
             blocks = [block for block in blocks if block.linear]
             blocks.append(leap_block(frame, ends, up, ahead))
-        w, size = frame.width, layout.size
-        prior = np.zeros((len(self._prior), size + 1))
-        prior[:, :w], prior[:, 2 * w : size] = self._prior[:, :w], self._prior[:, w:]
-        prior[:, -1] = self._prior_target
-        rows = [_dense(block, size) for block in blocks]
-        whole = triangle(np.concatenate([prior, *rows]))
-        rest = whole[w:size, w:]
-        self._prior, self._prior_target = rest[:, :-1], rest[:, -1]
+        self._prior, self._prior_target, log_mass = leapt(
+            self._prior_rows(), blocks, frame.width, layout.size
+        )
         self.first, self.count = slot, 2
         self.up, self.made_at = np.repeat(self.up[:1], 2), np.zeros((1, frame.interval))
         self.x = np.stack([start, self.predicted(start, np.array([frame.spacing]))[0]])
         self.linear = LinearRows(frame.width, frame.border, frame.height)
         self.breaks.clear()
         self._dirty = {slot}
-        return _left_mass(whole, w, size)
+        return log_mass
 
     def shift(self, slots: int) -> None:
         """Move all nodes by so many places: the clock was set."""
@@ -409,8 +355,8 @@ class Window:
         for name in (*names, *(name for name, _ in self.frame.shared)):
             after.put(vector, name, before.get(old_x, name))
         first, shared = (
-            self._columns_among(before, old_nodes),
-            self._columns_among(after, old_nodes),
+            columns_among(before, old_nodes),
+            columns_among(after, old_nodes),
         )
         size = old_nodes * frame.width + frame.border
         rows = np.zeros((len(old_prior), size + 1))
@@ -418,9 +364,9 @@ class Window:
         rows[:, -1] = old_target
         self.frame = frame
         fresh = [
-            _embedded(block, after, old_nodes)
+            embedded(block, after, old_nodes)
             for block in self._prior_blocks()
-            if not set(np.unique(block.columns)) & self._taken(before, after)
+            if not set(np.unique(block.columns)) & columns_known(before, after)
         ]
         stacked = np.concatenate([rows, *fresh])
         if len(stacked) > size:
@@ -513,81 +459,12 @@ class Window:
         return [linearised(b, x) for b in blocks]
 
     def _first_prior(self) -> tuple[FloatArray, FloatArray]:
-        rows = np.concatenate([_embedded(b, self.layout, 1) for b in self._prior_blocks()])
+        rows = np.concatenate([embedded(b, self.layout, 1) for b in self._prior_blocks()])
         return rows[:, :-1], rows[:, -1]
 
-    def _prior_rows(self) -> tuple[FloatArray, FloatArray, int]:
+    def _prior_rows(self) -> NearRows:
         nodes = (self._prior.shape[1] - self.frame.border) // self.frame.width
-        return self._prior, self._prior_target, nodes
-
-    def _near_rows(self, pings: RowsOf) -> tuple[FloatArray, FloatArray, int]:
-        """Linearised pings as rows over the first nodes and what is shared."""
-        w, b, inner = self.frame.width, self.frame.border, self.count * self.frame.width
-        columns, slope = pings.columns, pings.slope
-        inside = (columns >= 0) & (columns < inner)
-        nodes = int(np.where(inside, columns, 0).max(initial=0)) // w + 1
-        local = np.where(columns < inner, columns, columns - inner + nodes * w)
-        local = np.where(columns < 0, nodes * w + b, local)
-        m = len(slope)
-        size = nodes * w + b + 1
-        flat = (np.arange(m)[:, None] * size + local).ravel()
-        sums: Any = np.bincount(flat, slope.ravel(), minlength=m * size)
-        whole = sums.reshape(m, size)[:, :-1]
-        x = np.concatenate([self.x[:nodes].ravel(), self.common])
-        return whole, whole @ x - pings.residual, nodes
-
-    @staticmethod
-    def _columns_among(layout: Layout, nodes: int) -> dict[tuple[str, int, int], int]:
-        """Place in a prior's row of each column of the first nodes and of what is shared."""
-        places: dict[tuple[str, int, int], int] = {}
-        behind = (layout.node_count - nodes) * layout.node_width
-        for variable in layout.variables:
-            inside = variable.column < nodes * layout.node_width
-            if inside or variable.name in dict(layout.shared):
-                at = variable.column - (0 if inside else behind)
-                for i in range(variable.size):
-                    places[variable.name, variable.index, i] = at + i
-        return places
-
-    @staticmethod
-    def _taken(before: Layout, after: Layout) -> set[int]:
-        """Columns of the new layout's first node and shared states that the old one had."""
-        names = {v.name for v in before.variables}
-        taken: set[int] = set()
-        for v in after.variables:
-            if v.name in names:
-                taken.update(range(v.column, v.column + v.size))
-        return taken
-
-
-def _left_mass(whole: FloatArray, width: int, size: int) -> float:
-    """Logarithm of the integral over the first `width` of `size` columns, by the triangle of rows.
-
-    The last column holds right-hand sides; what stands below all others is the least residual.
-    """
-    residual = float(np.sum(whole[size:, size] ** 2))
-    pivots = np.abs(np.diagonal(whole)[:width])
-    return -0.5 * residual - float(np.log(np.maximum(pivots, np.finfo(float).tiny)).sum())
-
-
-def _dense(block: Block, size: int) -> FloatArray:
-    """Rows of a linear block over all columns, right-hand side behind them."""
-    assert isinstance(block, LinearBlock)
-    m, r, _ = block.matrix.shape
-    out = np.zeros((m, r, size + 2))
-    columns = np.where(block.columns < 0, size + 1, block.columns)
-    out[np.arange(m)[:, None, None], np.arange(r)[None, :, None], columns[:, None, :]] = (
-        block.matrix
-    )
-    out[:, :, size] = block.target
-    return out[:, :, : size + 1].reshape(m * r, -1)
-
-
-def _embedded(block: LinearBlock, layout: Layout, nodes: int) -> FloatArray:
-    """Rows of a block over the first nodes and what is shared, right-hand side behind them."""
-    rows = _dense(block, layout.size)
-    inner = layout.node_count * layout.node_width
-    return np.delete(rows, np.s_[nodes * layout.node_width : inner], axis=1)
+        return NearRows(self._prior, self._prior_target, nodes)
 
 
 def _runs(numbers: Iterable[int]) -> list[tuple[int, int]]:
