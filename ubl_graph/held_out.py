@@ -27,7 +27,8 @@ from ubl_graph.factors.ranges import RangeBlock
 from ubl_graph.noise_sources import STATED, NoiseSources, PingTable, pings_of
 from ubl_graph.problem import Frozen
 from ubl_graph.result import Result
-from ubl_graph.solved import Solved, descended, solved_again
+from ubl_graph.solve.banded import descended
+from ubl_graph.solved import Solved, solved_again
 
 #: Pings that are kept out together span at least so long, s.
 LEAST_BLOCK = 60.0

@@ -9,7 +9,6 @@ import numpy as np
 
 from ubl_graph.arrays import FloatArray
 from ubl_graph.builder import SegmentModel
-from ubl_graph.errors import SolverError
 from ubl_graph.graph import build_problem, model_segment
 from ubl_graph.initial import START_LIMIT
 from ubl_graph.layout import Layout
@@ -17,13 +16,9 @@ from ubl_graph.mission import Segment
 from ubl_graph.pose_trajectory import PoseTrajectory
 from ubl_graph.problem import Frozen, Problem
 from ubl_graph.result import Result, SegmentResult
-from ubl_graph.solve.banded import BandedDescent
+from ubl_graph.solve.banded import descended
 from ubl_graph.solve.normal import NormalEquations
 from ubl_graph.track import Track, place
-
-#: An iteration that lowers the cost by less than this ends a descent (a twentieth of a standard
-#: deviation), and it takes at most so many.
-AT_REST, MOST_ITERATIONS = 1e-3, 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,25 +65,6 @@ def solved_again(result: Result) -> Iterator[Solved]:
         equations = NormalEquations(problem)
         x = descended(equations, x, problem.frozen(x))
         yield Solved(problem, models, equations, x, problem.frozen(x))
-
-
-def descended(equations: NormalEquations, x: FloatArray, frozen: Frozen) -> FloatArray:
-    """The minimum near `x`, flat vector, to a small part of a standard deviation.
-
-    Raises
-    ------
-    SolverError
-        Where the cost there is not finite.
-    """
-    descent = BandedDescent(equations, x, frozen)
-    if not np.isfinite(descent.cost):
-        raise SolverError("a descent begins at a cost that is not finite")
-    for _ in range(MOST_ITERATIONS):
-        before = descent.cost
-        descent.iterate()
-        if before - descent.cost < AT_REST:
-            break
-    return descent.vector()
 
 
 def _as_solved(segment: Segment, solved: SegmentResult) -> Segment:

@@ -14,7 +14,7 @@ import numpy as np
 
 from ubl_graph.io.output_folder import scientific_cell, staged, time_cell, write_json, write_rows
 from ubl_graph.io.resolved import resolved
-from ubl_graph.io.result_files import RESIDUAL_COLUMNS, versions
+from ubl_graph.io.result_files import RESIDUAL_COLUMNS, residual_cells, versions
 from ubl_graph.result import RangeResiduals, SlowState
 from ubl_graph.survey import BeaconCheck, SurveyResult
 
@@ -165,19 +165,8 @@ def _slow(state: SlowState) -> dict[str, Any]:
 
 def _residual_rows(result: SurveyResult) -> Iterator[list[str]]:
     r = result.residuals
-    for i, segment in enumerate(result.segments):
-        yield [
-            str(segment),
-            str(r.kind[i]),
-            str(r.beacon[i]),
-            time_cell(r.t_transmit[i]),
-            time_cell(r.t_receive[i]),
-            f"{r.travel_time[i]:.9f}",
-            f"{r.residual[i]:.9f}",
-            f"{r.sigma[i]:.3e}",
-            f"{r.weight[i]:.4f}",
-            "yes" if r.found[i] else "no",
-        ]
+    for i, (segment, cells) in enumerate(zip(result.segments, residual_cells(r), strict=True)):
+        yield [str(segment), str(r.kind[i]), str(r.beacon[i]), *cells]
 
 
 def _slow_table(slow: dict[str, SlowState]) -> tuple[list[str], Iterator[list[str]]]:

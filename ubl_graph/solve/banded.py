@@ -14,6 +14,7 @@ import numpy as np
 from scipy.linalg import get_lapack_funcs
 
 from ubl_graph.arrays import FloatArray
+from ubl_graph.errors import SolverError
 from ubl_graph.factors.loss import RobustLoss
 from ubl_graph.problem import Frozen, LeastSquares
 from ubl_graph.solve.normal import NormalEquations, dot
@@ -29,6 +30,12 @@ from ubl_graph.solve.rounds import (
 _pbtrf, _pbtrs, _tbtrs, _potrf, _potrs = get_lapack_funcs(
     ("pbtrf", "pbtrs", "tbtrs", "potrf", "potrs"), dtype=np.float64
 )
+
+#: An iteration that lowers the cost by less than this ends a descent (a twentieth of a standard
+#: deviation): likelihoods are compared to a tenth or so.
+AT_REST = 1e-3
+#: Iterations of a descent, at most: whoever begins that far off is no good answer.
+MOST_ITERATIONS = 40
 
 
 class BandedFactor:
@@ -188,3 +195,22 @@ class BandedDescent:
             return BandedFactor(band, coupling, corner).solve(-gradient)
         except np.linalg.LinAlgError:
             return None
+
+
+def descended(equations: NormalEquations, x: FloatArray, frozen: Frozen) -> FloatArray:
+    """The minimum near `x`, flat vector, to a small part of a standard deviation.
+
+    Raises
+    ------
+    SolverError
+        Where the cost there is not finite.
+    """
+    descent = BandedDescent(equations, x, frozen)
+    if not np.isfinite(descent.cost):
+        raise SolverError("a descent begins at a cost that is not finite")
+    for _ in range(MOST_ITERATIONS):
+        before = descent.cost
+        descent.iterate()
+        if before - descent.cost < AT_REST:
+            break
+    return descent.vector()

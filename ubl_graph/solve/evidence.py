@@ -22,17 +22,11 @@ from dataclasses import replace
 import numpy as np
 
 from ubl_graph.arrays import BoolArray, FloatArray
-from ubl_graph.errors import SolverError
 from ubl_graph.factors.loss import RobustLoss
 from ubl_graph.problem import Frozen, LeastSquares, Problem
-from ubl_graph.solve.banded import BandedDescent, BandedFactor
+from ubl_graph.solve.banded import BandedFactor, descended
 from ubl_graph.solve.normal import NormalEquations, Point
 
-#: An iteration that lowers the cost by less than this ends the descent: likelihoods are compared
-#: to a tenth or so.
-AT_REST = 1e-3
-#: Iterations of a descent, at most: whoever begins that far off is no good answer.
-MOST_ITERATIONS = 40
 #: The interpolation's variance, and which pings are outliers, are taken anew so often.
 ROUNDS = 2
 #: Outliers are one ping in twenty, to begin with; their share is then what it is found to be.
@@ -70,7 +64,7 @@ def log_evidence(problem: Problem, x: FloatArray) -> tuple[float, FloatArray]:
     equations = NormalEquations(problem)
     frozen = problem.frozen(x)
     for _ in range(ROUNDS):
-        x = _minimum(equations, x, frozen)
+        x = descended(equations, x, frozen)
         before, frozen = frozen, problem.frozen(x)
         if _same(before, frozen):
             break
@@ -79,7 +73,7 @@ def log_evidence(problem: Problem, x: FloatArray) -> tuple[float, FloatArray]:
         equations = _normal(equations)
         for _ in range(ROUNDS):
             used, log_outliers = _without_outliers(equations.problem, x, frozen)
-            x = _minimum(equations, x, used)
+            x = descended(equations, x, used)
     point = equations.evaluate(x, used)
     half_log_det = _half_log_det(equations, point)
     if half_log_det is None:
@@ -132,18 +126,6 @@ def _outliers(residual: FloatArray, sigma: FloatArray) -> tuple[BoolArray, float
         outlier = normal < np.log(share / (2.0 * FARTHEST))
         share = min(max(float(outlier.sum()), 0.5) / len(residual), 0.5)
     return outlier, share
-
-
-def _minimum(equations: NormalEquations, x: FloatArray, frozen: Frozen) -> FloatArray:
-    descent = BandedDescent(equations, x, frozen)
-    if not np.isfinite(descent.cost):
-        raise SolverError("the likelihood's descent begins at a cost that is not finite")
-    for _ in range(MOST_ITERATIONS):
-        before = descent.cost
-        descent.iterate()
-        if before - descent.cost < AT_REST:
-            break
-    return descent.vector()
 
 
 def _half_log_det(equations: NormalEquations, point: Point) -> float | None:
