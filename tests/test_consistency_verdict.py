@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+import ubl_graph.consistency as consistency_module
+import ubl_graph.solved as solved_module
 from ubl_graph import (
     Beacon,
     ConfigurationError,
+    Consistency,
     FixedLagEstimator,
     Fleet,
     Member,
@@ -20,6 +23,7 @@ from ubl_graph import (
     Options,
     Segment,
     SoundSpeedProfile,
+    Start,
     smooth,
 )
 from ubl_graph.consistency import assess, calibrated, inflated, whiteness_of
@@ -30,10 +34,14 @@ from ubl_graph.noise_sources import SOURCES, STATED, pings_of, source_of, track_
 from ubl_graph.result import RangeResiduals, Result
 from ubl_graph.sim import (
     Sea,
+    ahrs,
     demo_survey,
+    dvl,
+    lawn_mower,
     planar_vehicle,
     pressure,
     sampled,
+    slant_ranges,
     straight_pass,
     two_way_pings,
     wander,
@@ -331,6 +339,75 @@ def test_few_pings_give_no_verdict():
     mended = calibrated(result)
     np.testing.assert_array_equal(mended.trajectory.covariance, result.trajectory.covariance)
     assert not mended.consistency.applied
+
+
+def test_what_no_ping_judges_gets_no_verdict():
+    """Of a mission with one beacon, nearly all of the variance is the heading reference's."""
+    found = assess(smooth(demo_survey(1)[0]))
+    assert found.trouble.endswith("what is known of biases and beacons beforehand")
+    assert found.shares["other"] > 0.5
+    assert "no verdict" in found.verdict
+    # What the pings do say of the noise is there, and can be used.
+    assert set(found.noise) == {"ranges", "motion", "medium"}
+
+
+def test_ranges_as_long_as_their_sigmas_are_no_predictions():
+    """A tank a few metres wide, and ranges of which nobody said that they are good."""
+    rng = np.random.default_rng(1)
+    truth = lawn_mower([0.0, 0.0], depth=1.0, lines=20, length=6.0, spacing=0.5, speed=0.2)
+    beacons = [Beacon("B1", [-2.0, -2.0, -3.0]), Beacon("B2", [8.0, 2.0, -2.0])]
+    end = truth.span[1] - 6.0
+    t = np.arange(0.0, end)
+    pings = slant_ranges(truth, beacons, t[1:], rng, sigma=0.2)
+    segment = Segment(
+        slant_range=replace(pings, sigma=np.full(len(pings), 1.0)),
+        depth=pressure(truth, t, rng),
+        velocity=dvl(truth, t, rng),
+        attitude=ahrs(truth, t),
+        start=Start(0.0, 0.0, 0.0, sigma=1.0),
+    )
+    found = assess(smooth(Mission((segment,), tuple(beacons), PROFILE)))
+    assert not found.trouble and found.factor < 1.0
+
+
+def test_long_missions_are_judged_by_excerpts(monkeypatch, right):
+    """Cut into excerpts the verdict is that of the whole, but for what chance makes of fewer."""
+    whole = assess(right)
+    monkeypatch.setattr(solved_module, "LONG", 300)
+    monkeypatch.setattr(solved_module, "EXCERPTS", 2)
+    monkeypatch.setattr(consistency_module, "LEAST_BLOCKS", 2)
+    cut = assess(right)
+    assert 2 <= cut.blocks < whole.blocks
+    assert not cut.trouble
+    assert abs(np.log(cut.factor / whole.factor)) < 3.0 * np.hypot(cut.log_sigma, whole.log_sigma)
+    assert cut.shares == whole.shares
+
+
+def test_an_open_segment_leaves_the_verdict_to_the_others(right):
+    two = drifter(2)
+    silent = replace(two.segments[0], name="open", reference=None)
+    first = replace(right.mission.segments[0], name="sound")
+    result = smooth(replace(right.mission, segments=(first, silent)))
+    whole = assess(result)
+    broken = replace(result.segments[1], status="unobservable", reason="a reason")
+    found = assess(replace(result, segments=(result.segments[0], broken)))
+    assert found.left_out == ("open",) and whole.left_out == ()
+    assert found.blocks < whole.blocks
+    assert found.verdict.endswith("not judged: open")
+    alone = assess(smooth(replace(right.mission, segments=(first,))))
+    assert found.factor == pytest.approx(alone.factor, rel=1e-2)
+
+
+def test_odometry_without_a_covariance_is_inflated_by_the_options():
+    mission, _ = planar_vehicle(3, duration=660.0)
+    odometry = replace(mission.segments[0].odometry, covariance=None)
+    mission = replace(mission, segments=(replace(mission.segments[0], odometry=odometry),))
+    loud = Consistency(noise={"ranges": 1.0, "motion": 2.5, "medium": 1.0})
+    options = inflated(mission, loud).options
+    for name in ("way_noise", "time_noise", "way_turn_noise_deg", "time_turn_noise_deg"):
+        assert getattr(options, f"odometry_{name}") == pytest.approx(
+            2.5 * getattr(mission.options, f"odometry_{name}")
+        )
 
 
 def test_an_undetermined_track_gets_no_verdict(right):

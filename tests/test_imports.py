@@ -56,6 +56,7 @@ ORDER = [
     "pose_assembly",
     "odometry_fill",
     "assembly",
+    "steadiness",
     "hypotheses",
     "work",
     "solved",

@@ -368,3 +368,47 @@ def test_other_kinds_of_ranges(kind):
     assert (np.abs(error) < 4.0 * result.sigma).all() and result.sigma.max() < 1.5
     if kind == "one_way":
         assert result.slow["clock_offset"].value[0, 0] == pytest.approx(0.3, abs=2e-3)
+
+
+# Clocks and single ranges
+
+
+def test_a_clock_that_was_set_between_two_dives_is_two_clocks():
+    truth = lawn_mower([-400.0, -400.0], depth=0.0, lines=5, length=800.0, spacing=200.0, speed=2.5)
+    places = [
+        Beacon(f"B{k}", [700.0 * np.cos(2 * k), 700.0 * np.sin(2 * k), -1e3]) for k in range(3)
+    ]
+    sea, times = Sea(SoundSpeedProfile.constant(1500.0)), np.arange(0.0, 1790.0)
+    segments = []
+    for k, offset in enumerate((0.5, 0.9)):
+        rng = np.random.default_rng(k)
+        heard = one_way_pings(
+            truth, places, np.arange(2.0, 1780.0, 6.0), sea, rng, clock=Clock(offset, 1e-8)
+        )
+        fixed = fixes(truth, times, rng, sigma=0.05, horizontal=False)
+        by = 86400.0 * k
+        heard = replace(heard, t_transmit=heard.t_transmit + by, t_receive=heard.t_receive + by)
+        segments.append(
+            Segment(f"dive {k}", one_way_range=heard, position=replace(fixed, t=fixed.t + by))
+        )
+    mission = Mission(tuple(segments), tuple(places), sea.profile)
+    result = calibrate(mission, STATED)
+    true = np.array([b.position for b in places])
+    assert result.status == "converged"
+    assert nees(result, true) < chi2.ppf(0.999, 9)
+    assert np.abs(result.position - true).max() < 3.0
+    clock = result.slow["clock_offset"]
+    assert clock.value[clock.t < 4e4].mean() == pytest.approx(0.5, abs=2e-3)
+    assert clock.value[clock.t > 4e4].mean() == pytest.approx(0.9, abs=2e-3)
+
+
+def test_a_single_range_leaves_its_beacon_open():
+    truth = lawn_mower([0.0, 0.0], depth=0.0, lines=1, length=100.0, spacing=10.0, speed=1.0)
+    rng, beacon = np.random.default_rng(1), Beacon("B", [300.0, 0.0, -100.0])
+    segment = Segment(
+        slant_range=slant_ranges(truth, [beacon], np.array([10.0]), rng, sigma=1.0),
+        position=fixes(truth, np.array([10.0]), rng, sigma=0.1, horizontal=False),
+    )
+    mission = Mission((segment,), (beacon,), SoundSpeedProfile.constant(1500.0))
+    result = calibrate(mission, STATED)
+    assert result.status == "unobservable"

@@ -20,13 +20,15 @@ from ubl_graph.mission import Mission, Segment
 from ubl_graph.noise_sources import SOURCES, STATED, pings_of, track_shares
 from ubl_graph.pose_trajectory import PoseTrajectory
 from ubl_graph.result import RangeResiduals, Result, SegmentResult, Shared
-from ubl_graph.solved import solved_again
+from ubl_graph.solved import excerpts, solved_again
 from ubl_graph.trajectory import NodeCovariance, Trajectory
 from ubl_graph.variance_fit import VarianceFit
 from ubl_graph.verdict import Consistency, Whiteness
 
 #: Fewer blocks than this give no verdict.
 LEAST_BLOCKS = 8
+#: Where priors and the like make more than this share of the variance there is none either.
+MOST_UNSEEN = 0.5
 #: Lags of Ljung and Box's test, at most.
 LAGS = 10
 
@@ -44,22 +46,25 @@ def assess(result: Result) -> Consistency:
     Returns
     -------
     Consistency
-        With `trouble` instead of a verdict where the track is not determined, or where there are
-        fewer than 8 blocks of pings to predict.
+        With `trouble` instead of a verdict where no segment's track is determined, where there are
+        fewer than 8 blocks of pings to predict, or where most of the track's variance comes from
+        what no ping can judge. Segments that are not determined have no part in it.
     """
     if result.consistency is not None and result.consistency.applied:
         return result.consistency
     whiteness = {} if result.residuals is None else whiteness_of(result.residuals)
-    if result.status != "converged":
+    sound = {s.name for s in result.segments if s.status == "converged"}
+    left_out = tuple(s.name for s in result.segments if s.name not in sound)
+    if not sound:
         return Consistency(trouble=f"the result is {result.status}", whiteness=whiteness)
     told: list[Prediction] = []
     shares: list[FloatArray] = []
     try:
         for solved in solved_again(result):
             pings = pings_of(solved)
-            if len(pings):
-                told += predictions(solved, pings)
+            if len(pings) and sound.issuperset(m.segment.name for m in solved.models):
                 shares.append(track_shares(solved, pings))
+                told += [p for part in excerpts(result, solved) for p in predictions(part)]
     except SolverError as error:
         return Consistency(trouble=str(error), whiteness=whiteness)
     blocks, pings = counted(told)
@@ -69,21 +74,32 @@ def assess(result: Result) -> Consistency:
             f"{LEAST_BLOCKS} would do"
         )
         return Consistency(trouble=trouble, blocks=blocks, pings=pings, whiteness=whiteness)
-    return replace(_judged(told, np.concatenate(shares)), whiteness=whiteness)
+    return replace(_judged(told, np.concatenate(shares)), whiteness=whiteness, left_out=left_out)
 
 
 def _judged(told: Sequence[Prediction], shares: FloatArray) -> Consistency:
     """The verdict of some predictions on a track whose variance comes from `shares` (M, 5)."""
-    single = VarianceFit([p for p in told if p.kind == "ping"])
+    alone = [p for p in told if p.kind == "ping"]
     told = [p for p in told if p.kind != "ping"]
-    fit = VarianceFit(told)
-    best, mean = _combined(fit.best(), single.best()), shares.mean(axis=0)
-    logs = 0.5 * np.log(_combined(fit.without_each(), single.without_each()) @ mean)
+    fit, mean = VarianceFit(told), shares.mean(axis=0)
+    best, each = fit.best(), fit.without_each()
+    # Pings that are all but as long as their sigma are no predictions (`held_out.LOST`).
+    if len(alone) >= len(each):
+        single = VarianceFit(alone)
+        best, each = _combined(best, single.best()), _combined(each, single.without_each())
+    logs = 0.5 * np.log(each @ mean)
     # Jackknife over groups of neighbours (Efron and Tibshirani 1993, ch. 11).
     spread = float(np.sqrt((len(logs) - 1.0) * np.mean((logs - logs.mean()) ** 2)))
     # Divided by a factor that errs by `spread` itself, a squared error is too large on average.
     factor = _factor(best, mean) * float(np.exp(spread**2))
     blocks, pings = counted(told)
+    unseen = float(mean[SOURCES.index("other")])
+    trouble = ""
+    if unseen > MOST_UNSEEN:
+        trouble = (
+            f"{100 * unseen:.0f} % of the track's variance comes from what no held-out ping can "
+            "judge: starts, fixes, depths, and what is known of biases and beacons beforehand"
+        )
     whitened = np.concatenate([p.whitened for p in told])
     unit = float(np.median([p.unit for p in told]))
     return Consistency(
@@ -96,6 +112,7 @@ def _judged(told: Sequence[Prediction], shares: FloatArray) -> Consistency:
         pings=pings,
         nis=sum(p.nis for p in told) / len(whitened),
         coverage=float(np.mean(whitened**2 < chi2.ppf(0.95, 1))),
+        trouble=trouble,
     )
 
 
@@ -220,19 +237,23 @@ def inflated(mission: Mission, found: Consistency) -> Mission:
     mission : Mission
         What `found` judged.
     found : Consistency
-        Without a verdict the mission stays as it is.
+        Where no ping was predicted the mission stays as it is.
     """
-    if found.trouble:
+    if not found.noise:
         return mission
     ranges, motion, medium = (max(found.noise[name], 1.0) for name in SOURCES[:3])
     options = mission.options
     segments = tuple(_inflated_segment(s, ranges, motion) for s in mission.segments)
-    walks = {"sound_speed_walk": medium * options.number("sound_speed_walk")}
+    walks: dict[str, float] = {"sound_speed_walk": medium * options.number("sound_speed_walk")}
     walks["clock_walk"] = medium * options.clock_walk
     if not any(s.velocity is not None or s.odometry is not None for s in mission.segments):
         name = "acceleration_psd" if options.is_constant_velocity else "jerk_psd"
         walks[name] = motion**2 * options.horizontal_psd
         walks[f"vertical_{name}"] = motion**2 * options.vertical_psd
+    if any(s.odometry is not None for s in mission.segments):
+        # Records without a covariance have theirs from the options.
+        for name in ("way_noise", "time_noise", "way_turn_noise_deg", "time_turn_noise_deg"):
+            walks[f"odometry_{name}"] = motion * getattr(options, f"odometry_{name}")
     return replace(mission, segments=segments, options=replace(options, **walks))
 
 

@@ -122,11 +122,12 @@ def held_out(result: Result) -> list[Prediction]:
     SolverError
         Where a solve fails on all data.
     """
-    return [p for solved in solved_again(result) for p in predictions(solved, pings_of(solved))]
+    return [p for solved in solved_again(result) for p in predictions(solved)]
 
 
-def predictions(solved: Solved, pings: PingTable) -> list[Prediction]:
+def predictions(solved: Solved) -> list[Prediction]:
     """The same of one problem; a kept-out part that leaves it singular is left out."""
+    pings = pings_of(solved)
     blocks = time_blocks(pings)
     some = _sample(np.unique(blocks[blocks >= 0]))
     told = np.isin(blocks, some) & ~pings.dropped

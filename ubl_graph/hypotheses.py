@@ -24,9 +24,9 @@ from ubl_graph.layout import Chain
 from ubl_graph.options import Options
 from ubl_graph.problem import Problem
 from ubl_graph.result import Hypothesis
-from ubl_graph.solve.evidence import log_evidence
 from ubl_graph.solve.marginals import Covariances, Marginals
 from ubl_graph.solve.rounds import Solution
+from ubl_graph.steadiness import log_mass
 
 #: An answer holds from this weight on: it is wrong once in twenty times at the most.
 HOLDS = 0.95
@@ -134,7 +134,7 @@ def _weighed(problem: Problem, solutions: Sequence[Solution]) -> list[Basin]:
     weighed: list[tuple[Solution, float, FloatArray]] = []
     for solution in cheap[:MOST_WEIGHED]:
         try:
-            mass, x = log_evidence(problem, solution.x)
+            mass, x = log_mass(problem, solution.x)
         except SolverError:
             mass, x = -np.inf, solution.x
         if not np.isfinite(mass):

@@ -29,6 +29,8 @@ from ubl_graph.work import Progress, Work, confirmed
 
 #: Costs nearer than this are equal: two engines, or machines, round differently.
 SAME_COST = 1e-6
+#: Mirror images of an answer are solved from, and so often of a better one that they lead to.
+MIRRORINGS = 3
 #: A profile may end so much above the deepest beacon, as a share of its depth.
 PROFILE_SLACK = 0.1
 #: Outliers are a few per cent; where a fifth of the pings disagree, something else is wrong.
@@ -229,10 +231,24 @@ def _expected(work: _Work, problem: Problem, starts: Sequence[Starts]) -> FloatA
 def _solved(
     work: _Work, problem: Problem, group: Sequence[SegmentModel], starts: Sequence[Starts]
 ) -> tuple[list[Basin], str]:
-    """The distinct solutions that were found, the answer first, and who solved it."""
+    """The distinct solutions that were found, the answer first, and who solved it.
+
+    They are looked for from the best start, from rivals of each segment, and from mirror images of
+    the cheapest solution and of the heaviest.
+    """
     choice = choose(problem, work.mission.options.solver)
-    best, others = _solve_from(work, choice.scout, problem, group, starts)
-    basins = weigh(problem, [best, *others])
+    solutions = _solve_from(work, choice.scout, problem, starts)
+    basins = weigh(problem, _ranked(solutions))
+    mirrored: list[Solution] = []
+    for _ in range(MIRRORINGS):
+        fresh = [basins[0].solution, _ranked(solutions)[0]]
+        fresh = [s for k, s in enumerate(fresh) if not any(s is t for t in [*mirrored, *fresh[:k]])]
+        images = [x for s in fresh for x in _images(work, problem, group, s)]
+        if not images:
+            break
+        mirrored += fresh
+        solutions += [work.solve(choice.scout, x) for x in images]
+        basins = weigh(problem, _ranked(solutions))
     best, solver, note = confirmed(work, choice, basins[0].solution)
     for text in filter(None, (choice.note, note)):
         work.warn(group[0].segment.name if len(group) == 1 else "", text)
@@ -254,35 +270,53 @@ def _search(work: _Work, model: SegmentModel) -> tuple[SegmentModel, Starts]:
 
 
 def _solve_from(
-    work: _Work,
-    engine: Engine,
-    problem: Problem,
-    group: Sequence[SegmentModel],
-    starts: Sequence[Starts],
-) -> tuple[Solution, list[Solution]]:
-    """Solve from the best start, from the rivals of a single segment, and from mirror images.
-
-    Returns the cheapest solution, and the others, cheapest first.
-    """
+    work: _Work, engine: Engine, problem: Problem, starts: Sequence[Starts]
+) -> list[Solution]:
+    """Solve from the best starts, and from each rival start of a segment."""
     begin = start_vector(work.mission, problem.layout, [s.tracks[0] for s in starts])
     solutions = work.solve_robustly(engine, begin)
-    layout = problem.layout
-    starts_at: list[FloatArray] = []
-    if len(group) == 1:
-        rivals = starts[0].tracks[1:]
-        starts_at += [start_vector(work.mission, layout, [track]) for track in rivals]
-    for chain, model in zip(layout.chains, group, strict=True):
-        if unanchored(model) is None:
-            found = track_of(layout, chain, solutions[0].x)
-            for image in mirror_images(work.mission, model, found):
-                x = solutions[0].x.copy()
-                place(layout, chain, image, x)
-                starts_at.append(x)
-    solutions += [work.solve(engine, x) for x in starts_at]
+    if len(starts) == 1:
+        rivals = [start_vector(work.mission, problem.layout, [t]) for t in starts[0].tracks[1:]]
+    else:
+        rivals = _each_elsewhere(problem, starts, solutions[0])
+    return solutions + [work.solve(engine, x) for x in rivals]
+
+
+def _each_elsewhere(
+    problem: Problem, starts: Sequence[Starts], found: Solution
+) -> list[FloatArray]:
+    """A solution of several segments with one of them at a rival start; flat vectors."""
+    vectors: list[FloatArray] = []
+    for chain, each in zip(problem.layout.chains, starts, strict=True):
+        for track in each.tracks[1:]:
+            x = found.x.copy()
+            place(problem.layout, chain, track, x)
+            vectors.append(x)
+    return vectors
+
+
+def _ranked(solutions: Sequence[Solution]) -> list[Solution]:
+    """The cheapest first."""
     # Mirror images cost the same but for rounding: of equals the first stays the answer.
     least = min(s.cost for s in solutions)
     best = next(s for s in solutions if s.cost <= least + SAME_COST)
-    return best, sorted((s for s in solutions if s is not best), key=lambda s: s.cost)
+    return [best, *sorted((s for s in solutions if s is not best), key=lambda s: s.cost)]
+
+
+def _images(
+    work: _Work, problem: Problem, group: Sequence[SegmentModel], found: Solution
+) -> list[FloatArray]:
+    """A solution with one segment's track mirrored, in each way that there is; flat vectors."""
+    images: list[FloatArray] = []
+    for chain, model in zip(problem.layout.chains, group, strict=True):
+        if unanchored(model) is not None:
+            continue
+        track = track_of(problem.layout, chain, found.x)
+        for image in mirror_images(work.mission, model, track):
+            x = found.x.copy()
+            place(problem.layout, chain, image, x)
+            images.append(x)
+    return images
 
 
 @dataclass

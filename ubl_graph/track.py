@@ -20,6 +20,13 @@ from ubl_graph.trajectory import Trajectory
 LEAST_MOVE = 1.0
 #: Standard deviations of a known point that rule out a track: a cost of 50, odds of 1e21.
 RULED_OUT = 10.0
+#: Beacons that spread across a line by no more than this share of what they spread along it are in
+#: line: what tells their two sides apart is small, and for the solver to judge.
+IN_LINE = 0.1
+#: Two courses are one where the sine of the angle between them is no larger than this.
+ALONG = 0.05
+#: Crossings of the line through the beacons that are looked at, at most.
+MOST_FOLDS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,13 +187,13 @@ def _turned_over(rotation: FloatArray, old: FloatArray, new: FloatArray) -> Floa
 
 
 def mirror_images(mission: Mission, model: SegmentModel, track: Track) -> list[Track]:
-    """Tracks that the ranges to a single beacon cannot tell from this one.
+    """Tracks that the ranges to a single beacon, or to beacons in line, cannot tell from this one.
 
     Without odometry they fit as well, but for what is known of points, when reflected in a vertical
-    plane through the beacon: along the mean course, or through the start where a prior holds that.
-    Odometry knows the heading, but not on which side of the beacon a straight track went by: there
-    the track is moved across its course to the other side. Windows find such images too, but on a
-    valley of answers only by luck.
+    plane: the one through all beacons, or through a single one along the mean course, or through
+    the start where a prior holds that. Odometry knows the heading, but not on which side of the
+    beacons a straight track went by: there the track is moved across to the other side. Windows
+    find such images too, but on a valley of answers only by luck.
 
     Parameters
     ----------
@@ -198,19 +205,58 @@ def mirror_images(mission: Mission, model: SegmentModel, track: Track) -> list[T
     Returns
     -------
     list of Track
-        Empty with a second beacon, or without any.
+        Empty where beacons stand all around, or where there are none.
     """
-    segment, name = model.segment, _lone_beacon(model)
-    if name is None:
+    segment, beacons = model.segment, _in_line(mission, model)
+    if beacons is None:
         return []
-    beacon = next(b for b in mission.beacons if b.name == name).position[:2]
-    axes = [track.position[-1, :2] - track.position[0, :2]]
+    point = beacons.mean(axis=0)
+    axes = _mirrors(model, track, beacons)
     if _has_odometry(model):
-        images = [_beyond(track, beacon, axis) for axis in axes if np.linalg.norm(axis) > 1.0]
+        images = [_beyond(track, point, axis) for axis in axes]
         return [image for image in images if _is_conceivable(segment, track, image)]
-    if segment.start is not None:
-        axes.append(np.array([segment.start.east, segment.start.north]) - beacon)
-    return [_reflected(track, beacon, axis) for axis in axes if np.linalg.norm(axis) > 1.0]
+    images = [_reflected(track, point, axis) for axis in axes]
+    if len(beacons) > 1:
+        images += [f for image in images for f in _folded(track, image, point, axes[0])]
+    return images
+
+
+def _folded(track: Track, image: Track, point: FloatArray, axis: FloatArray) -> list[Track]:
+    """A track that turns into its image where it comes to the mirror, once for each such place.
+
+    Where it crosses the line through the beacons the ranges would be the same had it turned back.
+    """
+    side = (track.position[:, :2] - point) @ np.array([-axis[1], axis[0]])
+    crossings = np.flatnonzero(np.diff(np.sign(side)) != 0) + 1
+    if len(crossings) > MOST_FOLDS:
+        crossings = crossings[np.linspace(0, len(crossings) - 1, MOST_FOLDS).astype(int)]
+    folded: list[Track] = []
+    for k in crossings:
+        parts: dict[str, FloatArray] = {}
+        for name in ("position", "velocity", "acceleration", "rotation"):
+            here, there = getattr(track, name), getattr(image, name)
+            if here is not None:
+                parts[name] = np.concatenate([here[:k], there[k:]])
+        folded.append(replace(track, **parts))
+    return folded
+
+
+def _mirrors(model: SegmentModel, track: Track, beacons: FloatArray) -> list[FloatArray]:
+    """Lines through beacons in line (B, 2) to mirror a track in: directions (2,)."""
+    if len(beacons) > 1:
+        return [_principal(beacons - beacons.mean(axis=0))]
+    way = track.position[-1, :2] - track.position[0, :2]
+    axes = [way] if np.linalg.norm(way) > LEAST_MOVE else []
+    if _has_odometry(model):
+        # There and back again, the way as a whole says nothing of the course.
+        steps = np.diff(track.position[:, :2], axis=0)
+        course = _principal(steps) if len(steps) else np.zeros(2)
+        if not axes or abs(course[0] * way[1] - course[1] * way[0]) > ALONG * np.linalg.norm(way):
+            axes.append(course)
+    elif model.segment.start is not None:
+        start = np.array([model.segment.start.east, model.segment.start.north])
+        axes.append(start - beacons[0])
+    return [axis for axis in axes if axis.any()]
 
 
 def unanchored(model: SegmentModel) -> str | None:
@@ -247,11 +293,33 @@ def unanchored(model: SegmentModel) -> str | None:
 
 def _lone_beacon(model: SegmentModel) -> str | None:
     """Name of the only beacon heard, None where there are others or none."""
+    heard = _heard(model)
+    return heard.pop() if len(heard) == 1 else None
+
+
+def _heard(model: SegmentModel) -> set[str]:
+    """Names of the beacons heard."""
     segment = model.segment
     kinds = (segment.two_way_range, segment.one_way_range, segment.slant_range)
-    ranges = [r for r in kinds if r is not None]
-    heard = {str(name) for r in ranges for name in r.beacon}
-    return heard.pop() if len(heard) == 1 else None
+    return {str(name) for r in kinds if r is not None for name in r.beacon}
+
+
+def _in_line(mission: Mission, model: SegmentModel) -> FloatArray | None:
+    """East and north (B, 2) of the beacons heard; None where they do not stand in a line."""
+    heard = _heard(model)
+    places = np.array([b.position[:2] for b in mission.beacons if b.name in heard])
+    if not len(places):
+        return None
+    middle = places.mean(axis=0)
+    if np.abs(places - middle).max() < LEAST_MOVE:
+        return middle[None]
+    spread = np.linalg.svd(places - middle, compute_uv=False)
+    return places if spread[1] <= IN_LINE * spread[0] else None
+
+
+def _principal(vectors: FloatArray) -> FloatArray:
+    """Unit vector (2,) along which most of some vectors (M, 2) lie."""
+    return np.linalg.svd(vectors, full_matrices=False)[2][0]
 
 
 def _has_odometry(model: SegmentModel) -> bool:

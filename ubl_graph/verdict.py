@@ -66,6 +66,8 @@ class Consistency:
         Share of the predictions inside their 95 % interval.
     whiteness : dict of str to Whiteness
         Of the residuals, by beacon.
+    left_out : tuple of str
+        Segments whose track is not determined; they have no part in it.
     trouble : str
         Why nothing is known; empty where there is a verdict.
     applied : bool
@@ -82,6 +84,7 @@ class Consistency:
     nis: float = float("nan")
     coverage: float = float("nan")
     whiteness: dict[str, Whiteness] = field(default_factory=dict[str, Whiteness])
+    left_out: tuple[str, ...] = ()
     trouble: str = ""
     applied: bool = False
 
@@ -128,6 +131,8 @@ class Consistency:
                 f"sigmas are {1.0 / self.factor:.1f} times too large "
                 f"({1.0 / high:.1f} to {1.0 / low:.1f}, {told})"
             )
+        if self.left_out:
+            text += f"; not judged: {', '.join(self.left_out)}"
         return text + ("; covariances are scaled by it" if self.applied else "")
 
     def _causes(self) -> str:

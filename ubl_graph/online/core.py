@@ -11,7 +11,7 @@ import numpy as np
 from ubl_graph.online.buffer import ABSOLUTE, PINGS, Entry, entry_of
 from ubl_graph.online.clock import MOST_HELD
 from ubl_graph.online.finder import Finder
-from ubl_graph.online.frame import Break
+from ubl_graph.online.frame import CLOCK_STEP
 from ubl_graph.online.gate import REOPENS, Gate, limit, step_distance
 from ubl_graph.online.outputs import Event, Outcome
 
@@ -28,8 +28,6 @@ SILENCE, SILENCE_INTERVALS = 1.0, 5.0
 DIVE_PSD = 0.05
 #: Vertical speed (m/s), and sudden step (m), of a vehicle whose height follows its depth sensor.
 HEAVE = 0.5
-#: The step that a clock set back may hide: seconds of way, m, and speed, m/s.
-CLOCK_STEP = Break(5.0, 0.5)
 
 
 class Core(Finder):
@@ -162,11 +160,12 @@ class Core(Finder):
         """Move what is known back with the clock, and take the run of records behind it."""
         clock, tracker = self.clock, self.tracker
         assert clock.now is not None
-        self.forget_rivals()
         refused: list[Entry] = []
+        taken: list[Entry] = []
         for entry in run:
             if tracker.buffer.twin(entry) is entry:
                 tracker.buffer.remove(entry)
+                taken.append(entry)
             else:
                 self.gates[entry.kind].rejected[entry.reason] -= 1
                 refused.append(entry)
@@ -184,10 +183,11 @@ class Core(Finder):
             self.state.last_output = None
         assert clock.now is not None
         self.noted(f"the clock was set back by {step:.3g} s", clock.now + self.setup.options.lag)
+        joint = math.floor((clock.now + 1e-9) / tracker.spacing)
         if tracker.window is not None:
             tracker.window.touch_all()
-            joint = math.floor((clock.now + 1e-9) / tracker.spacing)
             tracker.window.breaks[joint] = CLOCK_STEP
+        self.set_rivals_back(taken, slots, joint)
         self.state.clock_steps += 1
         for entry in sorted(run, key=lambda e: e.t):
             entry.gated, entry.reason = False, ""

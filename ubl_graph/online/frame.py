@@ -37,6 +37,10 @@ class Break:
     rate: float = 0.1
 
 
+#: The step that a clock set back may hide: seconds of way, m, and speed, m/s.
+CLOCK_STEP = Break(5.0, 0.5)
+
+
 @dataclass(frozen=True)
 class Frame:
     """What the unknowns of a window are, wherever it stands.

@@ -140,6 +140,7 @@ class Memory:
     ambiguous: str = ""
     rival: FloatArray | None = None
     rival_weight: float = 0.5
+    weighed_pings: int = 0
     rebuilt: bool = False
     notes: dict[str, float] = field(default_factory=dict[str, float])
     clock_steps: int = 0

@@ -9,7 +9,7 @@ by odds of 20 to 1: a position that changes sides at every ping serves nobody.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,6 +18,7 @@ import numpy as np
 from ubl_graph.arrays import FloatArray
 from ubl_graph.hypotheses import APART, COVERED_SIGMAS, HOLDS, KEPT
 from ubl_graph.online.buffer import PINGS, Entry
+from ubl_graph.online.frame import CLOCK_STEP
 from ubl_graph.online.gate import limit
 from ubl_graph.online.keeper import Keeper, Rival
 from ubl_graph.online.outputs import Place, sound
@@ -28,6 +29,10 @@ from ubl_graph.trajectory import Trajectory
 
 #: So many tracks are carried beside the estimator's own at the most: each costs as much as it.
 MOST_CARRIED = 3
+#: By chance the pings to one beacon speak for either side of a vehicle that keeps its course: the
+#: noise of its odometry is taken for a shape. The logarithm of the odds then scatters by no more
+#: than the root of their number; what lies within so many times that says nothing.
+CHANCE = 2.0
 
 
 class Rivals(Keeper):
@@ -48,8 +53,11 @@ class Rivals(Keeper):
         hold for another.
         """
         assert found.result is not None
+        window = self.tracker.window
+        assert window is not None
         if not self.rivals:
             self.tracker.is_weighed, self.tracker.past = True, 0.0
+            self.state.weighed_pings = len(window.usable())
         for number, hypothesis in enumerate(found.result.segments[0].hypotheses):
             if len(self.rivals) == MOST_CARRIED:
                 break
@@ -72,6 +80,7 @@ class Rivals(Keeper):
 
     def follow(self, entry: Entry) -> None:
         """Take a record into the rivals' windows; a ping or fix is judged by each."""
+        self.state.weighed_pings += bool(self.rivals) and entry.kind in PINGS
         for rival in list(self.rivals):
             self._each(rival, lambda tracker, r=rival: self._taken(r, tracker, entry))
 
@@ -99,6 +108,21 @@ class Rivals(Keeper):
             if twin is not None:
                 rival.tracker.regate(twin, entry.gated)
 
+    def set_rivals_back(self, taken: Sequence[Entry], slots: int, joint: int) -> None:
+        """Move the rivals back with the clock, by so many nodes.
+
+        Parameters
+        ----------
+        taken : sequence of Entry
+            Records behind the step that were taken before it, and come again.
+        slots : int
+            How many nodes.
+        joint : int
+            Number of the interval in which the clock was set.
+        """
+        for rival in list(self.rivals):
+            self._each(rival, lambda tracker: _set_back(tracker, taken, slots, joint))
+
     def weigh(self, note: str) -> None:
         """Weigh the tracks; let go what is too unlikely, and leave one that no longer holds.
 
@@ -115,8 +139,7 @@ class Rivals(Keeper):
             mass = self._each(rival, lambda tracker: tracker.log_mass())
             if mass is not None:
                 masses.append(mass)
-        weights: FloatArray = np.exp(np.array(masses) - max(masses))
-        weights /= weights.sum()
+        weights = _weights(np.array(masses), self.state.weighed_pings)
         for rival, weight in zip(self.rivals, weights[1:], strict=True):
             rival.weight = float(weight)
         self.rivals.sort(key=lambda r: -r.weight)
@@ -165,6 +188,7 @@ class Rivals(Keeper):
         """Carry the estimator's own track alone."""
         self.rivals = []
         self.tracker.is_weighed, self.tracker.past = False, 0.0
+        self.state.weighed_pings = 0
 
     def _each(self, rival: Rival, work: Callable[[Reviser], Any]) -> Any:
         """What `work` gives; a rival whose solver fails is let go, and None comes back."""
@@ -223,11 +247,29 @@ class Rivals(Keeper):
         return wide
 
 
+def _weights(masses: FloatArray, pings: int) -> FloatArray:
+    """Posterior weights by logarithms of masses, but for what may be chance (`CHANCE`)."""
+    behind = masses - masses.max()
+    weights: FloatArray = np.exp(np.minimum(behind + CHANCE * pings**0.5, 0.0))
+    return weights / weights.sum()
+
+
 def _settled(tracker: Reviser, now: float) -> None:
     if tracker.is_due(now):
         tracker.decide(now)
         tracker.turned = []
     tracker.trim(now)
+
+
+def _set_back(tracker: Reviser, taken: Sequence[Entry], slots: int, joint: int) -> None:
+    for entry in taken:
+        twin = tracker.buffer.twin(entry)
+        if twin is not None:
+            tracker.buffer.remove(twin)
+    tracker.shift(slots=-slots)
+    assert tracker.window is not None
+    tracker.window.touch_all()
+    tracker.window.breaks[joint] = CLOCK_STEP
 
 
 def copied(tracker: Reviser) -> Reviser:

@@ -17,7 +17,7 @@ is likelier at the robust track (Torr and Zisserman 2000, MLESAC).
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -61,6 +61,40 @@ def log_evidence(problem: Problem, x: FloatArray) -> tuple[float, FloatArray]:
     SolverError
         Where the start or the cost is not finite.
     """
+    found = evidence(problem, x)
+    return found.log, found.x
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What `log_evidence` gives, and on what terms.
+
+    Attributes
+    ----------
+    log : float
+        Logarithm of the marginal likelihood.
+    x : array
+        The minimum, flat vector.
+    used : tuple
+        Standard deviations that outliers have no part in.
+    log_outliers : float
+        Log likelihood of the outliers.
+    """
+
+    log: float
+    x: FloatArray
+    used: Frozen
+    log_outliers: float
+
+
+def evidence(problem: Problem, x: FloatArray) -> Evidence:
+    """As `log_evidence`, with the terms on which it was found.
+
+    Raises
+    ------
+    SolverError
+        Where the start or the cost is not finite.
+    """
     equations = NormalEquations(problem)
     frozen = problem.frozen(x)
     for _ in range(ROUNDS):
@@ -74,11 +108,38 @@ def log_evidence(problem: Problem, x: FloatArray) -> tuple[float, FloatArray]:
         for _ in range(ROUNDS):
             used, log_outliers = _without_outliers(equations.problem, x, frozen)
             x = descended(equations, x, used)
+    return _told(equations, x, used, log_outliers)
+
+
+def on_same_terms(problem: Problem, found: Evidence, x: FloatArray) -> Evidence:
+    """The evidence with further linear blocks behind those of `found`, with the same outliers.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its blocks begin with those that `found` is of.
+    found : Evidence
+        Without the further blocks.
+    x : array
+        Where the descent begins, flat vector.
+
+    Raises
+    ------
+    SolverError
+        Where the cost is not finite.
+    """
+    equations = _normal(NormalEquations(problem))
+    used = (*found.used, *(None for _ in problem.blocks[len(found.used) :]))
+    return _told(equations, descended(equations, x, used), used, found.log_outliers)
+
+
+def _told(equations: NormalEquations, x: FloatArray, used: Frozen, log_outliers: float) -> Evidence:
     point = equations.evaluate(x, used)
     half_log_det = _half_log_det(equations, point)
-    if half_log_det is None:
-        return -np.inf, x
-    return _log_whitening(problem, used) + log_outliers - point.cost - half_log_det, x
+    log = -np.inf
+    if half_log_det is not None:
+        log = _log_whitening(equations.problem, used) + log_outliers - point.cost - half_log_det
+    return Evidence(float(log), x, used, log_outliers)
 
 
 def _same(before: Frozen, after: Frozen) -> bool:
@@ -139,7 +200,7 @@ def _half_log_det(equations: NormalEquations, point: Point) -> float | None:
     return float(np.log(pivots).sum())
 
 
-def _log_whitening(problem: Problem, frozen: Frozen) -> float:
+def _log_whitening(problem: LeastSquares, frozen: Frozen) -> float:
     """Sum over the rows of log det W."""
     total = 0.0
     for block, held in zip(problem.blocks, frozen, strict=True):

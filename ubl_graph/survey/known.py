@@ -121,7 +121,7 @@ class KnownSurvey:
         model = self._model
         track = np.concatenate([p.position.reshape(-1, 3)[:, :2] for p in model.pings])
         middle = track.mean(axis=0)
-        spread, axes = np.linalg.eigh(np.cov((track - middle).T))
+        spread, axes = np.linalg.eigh((track - middle).T @ (track - middle) / len(track))
         if np.sqrt(max(spread[0], 0.0)) > STRAIGHT_SHARE * typical_range(self._pings):
             return alone, ""
         across = axes[:, 0]

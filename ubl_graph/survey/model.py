@@ -46,6 +46,8 @@ HELD = 1e-9
 #: the same direction; were all its errors new from ping to ping, a thousand pings would seem to
 #: average them out.
 TRACK_ERROR = "track_error"
+#: Knots farther apart than so many spacings have a gap between them.
+WIDE_GAP = 1.5
 #: The share of a fix's variance that lasts, and for how long, s.
 LASTING_SHARE, LASTING_TIME = 0.5, 600.0
 #: Lasting error of a track without any, m.
@@ -250,19 +252,30 @@ class SurveyModel:
         }
         walks = self._walks(noise)
         blocks: list[LinearBlock] = []
-        for name, size in layout.slow:
+        for name, _ in layout.slow:
             columns = layout.node_columns(name, np.array([0]))
             if name == TRACK_ERROR:
                 blocks += self._track_error()
                 continue
+            if name.startswith("clock"):
+                # Clocks are set between dives: each stretch without a gap has its own.
+                columns = layout.node_columns(name, np.array([s.first for s in self._stretches()]))
             sigma = np.array(sigmas[name] / layout.unit(name))
-            blocks.append(linear.prior(name, columns, np.zeros((1, size)), sigma))
+            blocks.append(linear.prior(name, columns, np.zeros(columns.shape), sigma))
             if name in walks and len(self.chain.t) > 1:
                 blocks.append(self._walk(name, walks[name], sigmas[name]))
-        if layout.has("clock_offset") and len(self.chain.t) > 1:
+        if layout.has("clock_offset"):
             clock = max(options.clock_walk, 1e-10), max(options.clock_drift_walk, 1e-13)
-            blocks.append(linear.clock_walk(layout, self.chain, *clock))
+            stretches = [s for s in self._stretches() if len(s.t) > 1]
+            blocks += [linear.clock_walk(layout, s, *clock) for s in stretches]
         return blocks
+
+    def _stretches(self) -> list[Chain]:
+        """Knots between which there is no gap."""
+        t = self.chain.t
+        gaps = np.flatnonzero(np.diff(t) > WIDE_GAP * self.options.knot_spacing) + 1
+        firsts = [0, *(int(k) for k in gaps)]
+        return [Chain("", k, part) for k, part in zip(firsts, np.split(t, gaps), strict=True)]
 
     def _walks(self, noise: Noise) -> dict[str, float]:
         """Random walks of the states that wander."""
