@@ -34,6 +34,8 @@ KEEPS_COURSE = 0.5
 NO_PART = 30.0
 #: The velocity may change where nodes stand, once in so many seconds at the most, and so often.
 LEAST_GAP, MOST_KINKS = 2.0, 400
+#: What stands this near to a straight line stands on it, m.
+ON_LINE = 1e-4
 #: Blocks of residuals that see the shape of a track.
 SHAPE = ("odometry", "velocity", "heading", "attitude", "turn", "rate", "compass", "gyro")
 
@@ -87,7 +89,7 @@ def sees_shape(problem: Problem) -> bool:
 
 def wandering(problem: Problem, psd: float) -> Problem:
     """The problem of a vehicle whose velocity wanders with a noise density of `psd`, m^2/s^3."""
-    blocks = [b for chain in problem.layout.chains if (b := _kinks(problem.layout, chain, psd))]
+    blocks = [b for chain in problem.layout.chains for b in _wander(problem.layout, chain, psd)]
     return replace(problem, blocks=(*problem.blocks, *blocks))
 
 
@@ -99,23 +101,54 @@ def _scales(layout: Layout) -> FloatArray:
     return np.geomspace(LOOSEST, least, count + 1)
 
 
-def _kinks(layout: Layout, chain: Chain, psd: float) -> LinearBlock | None:
-    """Change of the horizontal velocity where the track may bend: ~ N(0, psd times the time)."""
+def _wander(layout: Layout, chain: Chain, psd: float) -> list[LinearBlock]:
+    """What ties the nodes of a chain to a velocity that wanders."""
     knots = _knots(chain.t)
     if len(knots) < 3:
-        return None
-    t = chain.t[knots]
-    before, after = np.diff(t)[:-1], np.diff(t)[1:]
-    sigma = np.sqrt(psd * 0.5 * (before + after))
+        return []
+    blocks = [_kinks(layout, chain, knots, psd)]
+    between = np.setdiff1d(np.arange(knots[-1]), knots)
+    return [*blocks, _bridges(layout, chain, knots, between, psd)] if len(between) else blocks
+
+
+def _kinks(layout: Layout, chain: Chain, knots: IntArray, psd: float) -> LinearBlock:
+    """Change of the horizontal velocity where the track may bend: ~ N(0, psd times the time)."""
+    before, after = np.diff(chain.t[knots])[:-1], np.diff(chain.t[knots])[1:]
     slopes = np.stack([1.0 / before, -1.0 / before - 1.0 / after, 1.0 / after], axis=1)
-    matrix = (slopes / sigma[:, None])[:, None, :, None] * np.eye(2)[None, :, None, :]
-    columns = layout.node_columns("position", chain.first + knots)[:, :2]
-    joined = np.concatenate([columns[:-2], columns[1:-1], columns[2:]], axis=1)
+    sigma = np.sqrt(psd * 0.5 * (before + after))
+    nodes = np.stack([knots[:-2], knots[1:-1], knots[2:]], axis=1)
+    return _of_three("kinks", layout, chain, nodes, slopes, sigma)
+
+
+def _bridges(
+    layout: Layout, chain: Chain, knots: IntArray, between: IntArray, psd: float
+) -> LinearBlock:
+    """Where nodes between two knots are off the straight line: as an integrated walk would be."""
+    last = np.searchsorted(knots, between)
+    nodes = np.stack([knots[last - 1], between, knots[last]], axis=1)
+    begin, t, end = chain.t[nodes].T
+    share = (t - begin) / (end - begin)
+    sigma = np.sqrt(psd * (end - begin) ** 3 / 3.0) * share * (1.0 - share)
+    weights = np.stack([share - 1.0, np.ones(len(share)), -share], axis=1)
+    return _of_three("bridges", layout, chain, nodes, weights, np.maximum(sigma, ON_LINE))
+
+
+def _of_three(
+    name: str,
+    layout: Layout,
+    chain: Chain,
+    nodes: IntArray,
+    weights: FloatArray,
+    sigma: FloatArray,
+) -> LinearBlock:
+    """Sums of the horizontal positions of three nodes (M, 3) of a chain: ~ N(0, sigma^2)."""
     rows = len(sigma)
+    matrix = (weights / sigma[:, None])[:, None, :, None] * np.eye(2)[None, :, None, :]
+    columns = layout.node_columns("position", chain.first + nodes.ravel())[:, :2]
     whitening = -2.0 * float(np.log(sigma).sum())
     return LinearBlock(
-        "kinks",
-        joined,
+        name,
+        columns.reshape(rows, 6),
         matrix.reshape(rows, 2, 6),
         np.zeros((rows, 2)),
         log_det=lambda: whitening,
