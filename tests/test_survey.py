@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
+from survey import Water, straight_track, survey
 
-from tests.survey import Water, straight_track, survey
 from ubl_graph.acoustics import SoundSpeedProfile
 from ubl_graph.beacon import Beacon
 from ubl_graph.errors import ConfigurationError, DataError

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from survey import TURNAROUND, survey
 from typer.testing import CliRunner
 
-from tests.survey import TURNAROUND, survey
 from ubl_graph.beacon import Beacon
 from ubl_graph.cli import app
 from ubl_graph.errors import UblGraphError
